@@ -14,6 +14,7 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from queue import Empty, Queue
 from typing import Any, Self
 
@@ -23,15 +24,15 @@ from numpy.typing import ArrayLike
 from ekfslam.arrays import Array, IntArray
 from ekfslam.config import Config, FrontEndConfig
 from ekfslam.data import inputs
-from ekfslam.data.checks import require_shape
+from ekfslam.data.checks import checked_pose, require_shape
 from ekfslam.data.images import Image, ImageRecording, PairCalibration
 from ekfslam.data.inputs import InertialNoise, InertialSamples, VelocityFrame
 from ekfslam.data.sequence import Sequence
 from ekfslam.errors import ClockError, ConfigError, DataError, LateError, NoVelocitiesError
 from ekfslam.filters.admission import Admission, Kind, LiveCounts
-from ekfslam.filters.door import checked_inputs, checked_stamp
+from ekfslam.filters.door import checked_inputs, checked_numbers, checked_stamp
 from ekfslam.filters.joint import JointEKF
-from ekfslam.filters.live import LiveEKF, Pose
+from ekfslam.filters.live import LiveEKF, Pose, require_window
 from ekfslam.filters.streams import Velocities
 from ekfslam.frontend.track import Tracking
 from ekfslam.geometry import se3
@@ -53,12 +54,15 @@ class Learner:
         self._config, self._window, self._lock = config, window, threading.Lock()
         self._inputs: deque[tuple[float, Array]] = deque(maxlen=MOST_INPUTS)
 
-    def take(self, kind: Kind, row: Array, t: float) -> None:
+    def require(self, kind: Kind) -> None:
+        """Raise a `ConfigError` for inputs of another kind than the first ones."""
+        if self.kind not in (None, kind):
+            raise ConfigError(f"this filter has a {self.kind} for an input: it cannot take a {kind}")
+        self.kind = kind
+
+    def take(self, row: Array, t: float) -> None:
         """Take inputs (6,)."""
         with self._lock:
-            if self.kind not in (None, kind):
-                raise ConfigError(f"this filter has a {self.kind} for an input: it cannot take a {kind}")
-            self.kind = kind
             if self.live is None:
                 self._inputs.append((t, row))
                 return
@@ -132,10 +136,11 @@ class Line:
     that were displaced, or whose tracks the filter could not take.
     """
 
-    def __init__(self, track: Callable[[Image, Image, float], None], most_pairs: int) -> None:
+    def __init__(self, track: Callable[..., None], most_pairs: int) -> None:
         self._track, self._most_pairs, self.skipped = track, most_pairs, 0
         self.errors: deque[Exception] = deque(maxlen=100)
-        self._pairs: Queue[tuple[Image, Image, float] | None] = Queue()
+        self._lock = threading.RLock()  # of the threads' begin and end: nothing is queued behind their end
+        self._pairs: Queue[tuple[Any, ...] | None] = Queue()
         self._jobs: Queue[Callable[[], None] | None] = Queue()
         self._threads: list[threading.Thread] = []
 
@@ -143,17 +148,21 @@ class Line:
         """Start both threads."""
         targets: list[tuple[Queue[Any], Callable[[Any], None]]]
         targets = [(self._pairs, lambda pair: self._track(*pair)), (self._jobs, lambda job: job())]
-        self._threads = [threading.Thread(target=self._work, args=target, daemon=True) for target in targets]
-        for thread in self._threads:
-            thread.start()
+        with self._lock:
+            if self._threads:
+                raise ConfigError("the threads run already: enter the context once")
+            self._threads = [threading.Thread(target=self._work, args=target, daemon=True) for target in targets]
+            for thread in self._threads:
+                thread.start()
 
     def stop(self) -> None:
         """Process everything that waits, and end both threads."""
         queues: tuple[Queue[Any], ...] = self._pairs, self._jobs
-        for queue, thread in zip(queues, self._threads, strict=False):
-            queue.put(None)
-            thread.join()
-        self._threads = []
+        with self._lock:
+            for queue, thread in zip(queues, self._threads, strict=False):
+                queue.put(None)
+                thread.join()
+            self._threads = []
 
     def wait(self) -> None:
         """Wait until nothing waits."""
@@ -170,18 +179,18 @@ class Line:
                 queue.task_done()
         queue.task_done()
 
-    def offer(self, left: Image, right: Image, t: float) -> None:
+    def offer(self, *pair: Any) -> None:
         """Track a pair, at once or in its thread; there it displaces the oldest one if too many wait."""
-        if not self._threads:
-            return self._track(left, right, t)
-        while self._pairs.qsize() >= self._most_pairs:
-            try:
-                self._pairs.get_nowait()
-            except Empty:
-                break
-            self._pairs.task_done()
-            self.skipped += 1
-        return self._pairs.put((left, right, t))
+        with self._lock:
+            while self._threads and self._pairs.qsize() >= self._most_pairs:
+                with suppress(Empty):
+                    self._pairs.get_nowait()
+                    self._pairs.task_done()
+                    self.skipped += 1
+            if self._threads:
+                self._pairs.put(pair)
+                return
+        self._track(*pair)
 
     def do(self, job: Callable[[], None]) -> None:
         """Do a job of the filter, at once or in its thread."""
@@ -234,7 +243,10 @@ class LiveStereo:
         self._config = (config or Config()).with_overrides({"filter": _BOUNDED})
         self._imu_noise, self._velocity_frame, self._learn = imu_noise, velocity_frame, learn
         self._window = {**window, "delay_s": delay_s, "late": "count"}
-        self._lock, self._frame_lock = threading.RLock(), threading.RLock()
+        require_window(**self._window)
+        checked_pose(checked_numbers(T_cam_imu, "T_cam_imu"), "T_cam_imu")
+        # Locks of messages, of the tracker, and of images, whose order stays that of their admission.
+        self._lock, self._frame_lock, self._image_lock = threading.RLock(), threading.RLock(), threading.RLock()
         self._admission = Admission("count", self._window.get("jump_s", 10.0))
         self.counts: LiveCounts = self._admission.counts
         self._line = Line(self._track, queue)
@@ -276,12 +288,13 @@ class LiveStereo:
 
     def _take(self, kind: Kind, row: Array, t: float) -> None:
         with self._lock:
+            learner = self._learner
+            learner.require(kind)
             if not self._admits(kind, t, None, self._driving.has(t)):
                 return
             self._driving.add(row, t)
             self._driving.drop(len(self._driving.stamps) - MOST_INPUTS)
-            learner = self._learner
-        learner.take(kind, row, t)
+        learner.take(row, t)
 
     def _admits(self, kind: Kind, t: float, last: float | None, is_repeated: bool = False) -> bool:
         if self._admission.has_jumped(kind, t, last):
@@ -297,28 +310,35 @@ class LiveStereo:
             ClockError: A clock has jumped: call `reset`.
             EkfslamError: An earlier frame could not be processed by a thread.
         """
-        t, (width, height) = checked_stamp(t), self._calibration.size
-        for name, image in (("left", left), ("right", right)):
-            require_shape(image, (height, width), name)
-            if np.asarray(image).dtype != np.uint8:
-                raise DataError(f"expected grey levels uint8, found {np.asarray(image).dtype}", field=name)
-        with self._lock:
-            self._raise_errors()
-            if not self._admits("image", t, self._newest):
-                return
-            self._newest = t
-        self._line.offer(left, right, t)
+        t, pair = checked_stamp(t), (self._checked(left, "left"), self._checked(right, "right"))
+        with self._image_lock:
+            with self._lock:
+                self._raise_errors()
+                if not self._admits("image", t, self._newest):
+                    return
+                self._newest, learner = t, self._learner
+            self._line.offer(*pair, t, learner)
+
+    def _checked(self, image: Image, name: str) -> Image:
+        """Return a copy of an image, since drivers use their memory again."""
+        width, height = self._calibration.size
+        if (dtype := getattr(image, "dtype", type(image).__name__)) != np.uint8:
+            raise DataError(f"expected grey levels uint8, found {dtype}", field=name)
+        require_shape(image, (height, width), name)
+        return np.array(image)
 
     def _raise_errors(self) -> None:
         if self._line.errors:
             raise self._line.errors.popleft()
 
-    def _track(self, left: Image, right: Image, t: float) -> None:
+    def _track(self, left: Image, right: Image, t: float, learner: Learner) -> None:
         """Track a pair, and hand its tracks, or those of the first frames together, to the filter."""
         with self._frame_lock:
+            if learner is not self._learner:  # it waited during a reset
+                self.counts.unused += 1
+                return
             before, self._tracked = self._tracked, t
             seen = self._tracking.add(left, right, None if before is None else self._moved(before, t))
-            learner = self._learner
             if self._first is not None:
                 self._first.append(t)
                 if len(self._first) >= self._learn:

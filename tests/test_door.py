@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from support.compiled import CAMERA, EXTRINSICS, NOISE
 
+from ekfslam import LiveEKF
+from ekfslam.config import FilterConfig
 from ekfslam.data.interval import Interval
 from ekfslam.errors import DataError, DuplicateObservationError, ShapeError, StampError
 from ekfslam.filters.door import (
@@ -17,6 +19,7 @@ from ekfslam.filters.door import (
     checked_stamp,
     require_measured,
 )
+from ekfslam.filters.joint import JointEKF
 from ekfslam.models.process import Measured
 from ekfslam.models.sensors.monocular import Monocular
 from ekfslam.models.sensors.stereo import Rig
@@ -135,3 +138,35 @@ def test_numbers_are_copied_and_bounded():
     for wrong in ([1.0, 3.0], [-3.0]):
         with pytest.raises(DataError, match="x"):
             checked_numbers(wrong, "x", largest=2.0)
+
+
+def of_rig(**wrong):
+    settings = {"camera": CAMERA, "T_cam_imu": EXTRINSICS, "noise": NOISE} | wrong
+    return LiveEKF.from_rig(**settings)
+
+
+POSES = [np.zeros((4, 4)), np.diag([1.0, 1.0, -1.0, 1.0]), np.full((4, 4), np.nan), np.eye(3), "x", 1j, [[1.0], []]]
+
+
+@pytest.mark.parametrize("wrong", POSES, ids=map(str, range(len(POSES))))
+@pytest.mark.parametrize("name", ["T_world_imu", "T_cam_imu"])
+def test_a_first_pose_and_extrinsics_that_are_not_rigid_are_refused(name, wrong):
+    with pytest.raises(DataError, match=name):
+        of_rig(**{name: wrong})
+
+
+@pytest.mark.parametrize("wrong", [1.0, -np.eye(6), np.triu(np.ones((6, 6))), np.eye(5), "x", np.full((6, 6), np.inf)])
+def test_a_first_covariance_that_is_none_is_refused(wrong):
+    with pytest.raises(DataError, match="covariance"):
+        JointEKF(Rig(CAMERA, EXTRINSICS, NOISE), FilterConfig(retire="unseen"), np.eye(4), wrong)
+
+
+def test_masked_numbers_are_refused():
+    with pytest.raises(DataError, match="velocities: expected numbers, found a masked entry"):
+        of_rig().predict(np.ma.masked_invalid([0.0, np.nan, 0.0, 0.0, 0.0, 0.0]), 0.0)
+
+
+def test_measurements_by_further_sensors_of_another_class_are_refused():
+    ekf = of_rig().ekf
+    with pytest.raises(DataError, match="also: expected Measured, found ndarray"):
+        ekf.predict(np.zeros(6), 0.1, np.zeros(6))

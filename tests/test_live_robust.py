@@ -249,7 +249,10 @@ def test_images_without_velocities_wait_up_to_a_bound(monkeypatch):
         live.update(*view(0.1 * i), 0.1 * i)
     with pytest.raises(BacklogError, match="too many images wait"):
         live.update(*view(0.3), 0.3)
-    assert (live.counts.images, live.counts.refused) == (3, 1)
+    for t in (0.3, 0.05, -0.1):  # an older one waits no less
+        with pytest.raises(BacklogError, match="too many images wait"):
+            live.update(*view(0.3), t)
+    assert (live.counts.images, live.counts.refused) == (3, 4)
 
 
 def naive(live, log, t):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import threading
 
@@ -14,7 +15,7 @@ from support.rendered import drive, recording
 
 from ekfslam import LiveStereo
 from ekfslam.config import Config, FrontEndConfig
-from ekfslam.errors import ClockError, ConfigError, DataError, EmptyTracksError, LateError
+from ekfslam.errors import ClockError, ConfigError, DataError, EkfslamError, EmptyTracksError, LateError
 from ekfslam.frontend.track import track
 from ekfslam.geometry import se3
 from ekfslam.live_stereo import Learner, Line
@@ -165,7 +166,89 @@ def test_nothing_waits_after_a_line_has_stopped():
 def test_velocities_before_the_first_frames_are_kept_for_them():
     learner, time_s = Learner(Config(), {}), 0.1 * np.arange(5)
     for k, t in enumerate(time_s):
-        learner.take("velocity", np.full(6, float(k)), t)
+        learner.require("velocity")
+        learner.take(np.full(6, float(k)), t)
     twist, samples = learner.recorded(time_s, None)
     np.testing.assert_allclose(twist[1:], np.arange(1.0, 5.0)[:, None] * np.ones(6), atol=1e-9)
     assert samples is None
+
+
+def test_pairs_offered_while_the_threads_end_are_tracked_and_none_waits_for_ever():
+    tracked: list[float] = []
+    line = Line(lambda t: tracked.append(t), most_pairs=1000)
+    line.start()
+    with pytest.raises(ConfigError, match="enter the context once"):
+        line.start()
+    others = [threading.Thread(target=lambda k=k: [line.offer(500.0 * k + i) for i in range(500)]) for k in range(3)]
+    for thread in others:
+        thread.start()
+    line.stop()
+    for thread in others:
+        thread.join()
+    waiter = threading.Thread(target=line.wait, daemon=True)
+    waiter.start()
+    waiter.join(10)
+    assert not waiter.is_alive() and len(tracked) + line.skipped == 1500
+
+
+@pytest.mark.parametrize("is_threaded", [False, True])
+def test_memory_of_the_driver_may_be_used_again_at_once(pairs, is_threaded):
+    found, images = pairs
+    stereo, buffers = new(found, queue=FRAMES), [np.empty_like(image) for image in images[0]]
+    with stereo if is_threaded else contextlib.nullcontext():
+        for k, t in enumerate(found.time_s[:8].tolist()):
+            for buffer, image in zip(buffers, images[k], strict=True):
+                buffer[:] = image
+            stereo.images(*buffers, t)
+            for buffer in buffers:
+                buffer[:] = 0
+        stereo.flush()
+    other = new(found)
+    for k, t in enumerate(found.time_s[:8].tolist()):
+        other.images(*images[k], t)
+    np.testing.assert_array_equal(stereo.pose().T_world_imu, other.pose().T_world_imu)
+
+
+@pytest.mark.slow
+def test_resets_among_images_of_another_thread_leave_no_pair_of_the_time_before(pairs):
+    found, images = pairs
+    stereo, errors = new(found, queue=100), []
+
+    def send():
+        try:
+            for k in range(60):
+                stereo.images(*images[k % FRAMES], 0.1 * k)
+        except EkfslamError as error:
+            errors.append(error)
+
+    with stereo:
+        sender = threading.Thread(target=send)
+        sender.start()
+        while sender.is_alive():
+            stereo.reset()
+        stereo.reset()
+        for k in range(8):
+            stereo.images(*images[k], 0.1 * k)
+        stereo.flush()
+    assert not errors and (stereo.live.counts.taken_in, stereo.skipped) == (8, 0)
+
+
+def test_inputs_of_another_kind_change_nothing(pairs):
+    found, images = pairs
+    stereo, other = new(found), new(found)
+    for k, t in enumerate(found.time_s[:8].tolist()):
+        for one in (stereo, other):
+            one.velocities(drive(FRAMES)[k], t)
+        if k:
+            with pytest.raises(ConfigError, match="cannot take a sample"):
+                stereo.imu(np.full(3, 5.0), np.full(3, 9.0), t - 0.05)
+        for one in (stereo, other):
+            one.images(*images[k], t)
+    assert stereo.counts == other.counts
+    np.testing.assert_array_equal(stereo.pose().T_world_imu, other.pose().T_world_imu)
+
+
+@pytest.mark.parametrize("wrong", [{"gap_s": -1.0}, {"delay_s": np.nan}, {"backlog": 0}, {"history_s": "x"}])
+def test_a_wrong_window_is_refused_before_the_first_frame(pairs, wrong):
+    with pytest.raises(ConfigError, match="must"):
+        new(pairs[0], **wrong)

@@ -16,6 +16,7 @@ from ekfslam.models.sensors.base import Sensor
 from ekfslam.models.sensors.monocular import Monocular
 from ekfslam.models.sensors.stereo import Rig
 
+ROUNDING = 1e-9  # of a covariance, relative to its largest entry
 # Numbers of an observation, by its sensor; others are judged by their rows.
 _WIDTHS: dict[type, tuple[int, ...]] = {Rig: (4,), Monocular: (2, 4)}
 
@@ -51,6 +52,16 @@ def checked_inputs(value: Any, size: int, name: str) -> Array:
     return found
 
 
+def checked_covariance(value: Any, size: int, name: str) -> Array:
+    """Return a covariance (size, size); raise `DataError` unless it is symmetric and positive semi-definite."""
+    P = checked_numbers(value, name)
+    require_shape(P, (size, size), name)
+    scale = np.abs(P).max()
+    if np.abs(P - P.T).max() > ROUNDING * scale or np.linalg.eigvalsh(0.5 * (P + P.T))[0] < -ROUNDING * scale:
+        raise DataError("expected a symmetric, positive semi-definite matrix", field=name)
+    return P
+
+
 def checked_interval(inputs: Interval | Any, tau_s: Any, is_gap: bool) -> Interval:
     """Return the interval of a prediction, given one or its only inputs (6,)."""
     if not isinstance(inputs, Interval):
@@ -72,6 +83,8 @@ def require_measured(also: Measured | None) -> None:
     """Raise `DataError` unless measurements of further sensors are finite, with positive standard deviations."""
     if also is None:
         return
+    if not isinstance(also, Measured):
+        raise DataError(f"expected Measured, found {type(also).__name__}", field="also")
     n = len(also.axis)
     for name in ("value", "std"):
         require_shape(checked_numbers(getattr(also, name), f"also.{name}"), (n,), f"also.{name}")
@@ -133,6 +146,8 @@ def _plain(value: Any, name: str) -> np.ndarray:
     """Return an array of anything but booleans and ragged lists."""
     if _has_booleans(value):
         raise DataError("expected numbers, found a truth value", field=name)
+    if np.ma.is_masked(value):
+        raise DataError("expected numbers, found a masked entry", field=name)
     try:
         return np.asarray(value)
     except (ValueError, OverflowError, TypeError) as error:

@@ -16,11 +16,20 @@ import numpy as np
 
 from ekfslam.arrays import Array, IntArray
 from ekfslam.config import CalibrationConfig, FilterConfig
+from ekfslam.data.checks import checked_pose
 from ekfslam.data.interval import Interval
 from ekfslam.errors import ConfigError
 from ekfslam.filters import compiled
 from ekfslam.filters import frame as frames
-from ekfslam.filters.door import checked_frame, checked_inputs, checked_interval, checked_observations, require_measured
+from ekfslam.filters.door import (
+    checked_covariance,
+    checked_frame,
+    checked_inputs,
+    checked_interval,
+    checked_numbers,
+    checked_observations,
+    require_measured,
+)
 from ekfslam.filters.estimate import Estimate
 from ekfslam.filters.lifecycle import Marginal, Relinearised, Retired, Revival
 from ekfslam.filters.log import Log
@@ -58,6 +67,7 @@ class JointEKF(Estimate):
     Raises:
         ConfigError: A calibration to estimate, but no `Rig`; neither a model nor a first pose; or a ``config.lag``
             without ``window``.
+        DataError: The first pose is not rigid, or its covariance not symmetric and positive semi-definite.
 
     Attributes:
         retired: Landmarks that have left the state.
@@ -80,7 +90,10 @@ class JointEKF(Estimate):
         elif T_world_imu is None:
             raise ConfigError("a filter of a sensor needs a first pose")
         else:
-            P_pose = config.initial_covariance if covariance is None else np.array(covariance, dtype=float)
+            P_pose = (
+                config.initial_covariance if covariance is None else checked_covariance(covariance, 6, "covariance")
+            )
+            checked_pose(checked_numbers(T_world_imu, "T_world_imu"), "T_world_imu")
             coordinates = config.landmark_coordinates
             model = model_of(sensor, sensor.noise, se3.inverse(T_world_imu), P_pose, calibration, blocks, coordinates)
         super().__init__(model, config)
@@ -261,7 +274,7 @@ class JointEKF(Estimate):
         name, unit, prior_std = self.model.labels
         if not name:
             return None
-        value, std = np.array(self._reported).transpose(1, 0, 2)
+        value, std = np.array(self._reported).reshape(-1, 2, len(name)).transpose(1, 0, 2)
         return Parameters(name, unit, prior_std, value, std)
 
     @property

@@ -21,11 +21,12 @@ from numpy.typing import ArrayLike
 
 from ekfslam.arrays import Array, IntArray
 from ekfslam.config import FilterConfig
+from ekfslam.data.checks import checked_pose
 from ekfslam.data.inputs import InertialNoise, InertialSamples
-from ekfslam.data.noise import Noise
+from ekfslam.data.noise import Noise, validate_noise
 from ekfslam.errors import ClockError, ConfigError, MissingVelocityError
 from ekfslam.filters.admission import Admission, Dropped, Kind
-from ekfslam.filters.door import ascending, checked_inputs, checked_observations, checked_stamp
+from ekfslam.filters.door import ascending, checked_inputs, checked_numbers, checked_observations, checked_stamp
 from ekfslam.filters.driven import Driven, copied
 from ekfslam.filters.estimate import Estimate
 from ekfslam.filters.joint import JointEKF
@@ -52,6 +53,28 @@ class Pose(NamedTuple):
     T_world_imu: Array
     covariance: Array
     is_held: bool
+
+
+def require_window(
+    *,
+    delay_s: float = 0,
+    history_s: float = 0,
+    late: str = "raise",
+    gap_s: float = 1,
+    jump_s: float = 1,
+    backlog: float = 1,
+    log_frames: float = 1,
+) -> None:
+    """Raise a `ConfigError` for arguments that `LiveEKF` cannot have."""
+    try:
+        is_good = min(delay_s, history_s) >= 0 and min(gap_s, jump_s) > 0 and min(backlog, log_frames) >= 1
+        has_nan = any(x != x for x in (delay_s, history_s, gap_s, jump_s, backlog, log_frames))
+    except TypeError:
+        is_good, has_nan = False, False
+    if has_nan or not is_good:
+        raise ConfigError("delay_s and history_s must not be negative; all other numbers must be positive")
+    if late not in ("raise", "count"):
+        raise ConfigError(f"late: expected 'raise' or 'count', found {late!r}")
 
 
 class LiveEKF:
@@ -89,10 +112,8 @@ class LiveEKF:
         backlog: int = 100_000,
         log_frames: float = 10_000,
     ) -> None:
-        if not (delay_s >= 0 and history_s >= 0 and gap_s > 0 and jump_s > 0 and backlog >= 1 and log_frames >= 1):
-            raise ConfigError("delay_s and history_s must not be negative; all other numbers must be positive")
-        if late not in ("raise", "count"):
-            raise ConfigError(f"late: expected 'raise' or 'count', found {late!r}")
+        window = {"gap_s": gap_s, "jump_s": jump_s, "backlog": backlog, "log_frames": log_frames}
+        require_window(delay_s=delay_s, history_s=history_s, late=late, **window)
         self.delay_s, self.gap_s, self.history_s = delay_s, gap_s, history_s
         self.jump_s, self.backlog, self.log_frames = jump_s, backlog, log_frames
         self.lock = threading.RLock()
@@ -135,6 +156,8 @@ class LiveEKF:
             window: Further arguments of `LiveEKF`.
         """
         settings = config or FilterConfig(retire="unseen")
+        checked_pose(checked_numbers(T_cam_imu, "T_cam_imu"), "T_cam_imu")
+        validate_noise(noise)
         start, rig = np.eye(4) if T_world_imu is None else T_world_imu, Rig(camera, T_cam_imu, noise)
         sensor = rig if imu is None else _inertial(rig, imu, start, settings, rest)
         return cls(JointEKF(sensor, settings, start), **window)
@@ -203,7 +226,8 @@ class LiveEKF:
         with self.lock:
             self._watch_clock("image", t)
             at = bisect_left(self._waiting, t, key=lambda image: image[0])
-            is_repeated, is_full = any(image[0] == t for image in self._waiting[at : at + 1]), at >= MOST_IMAGES
+            is_repeated = any(image[0] == t for image in self._waiting[at : at + 1])
+            is_full = len(self._waiting) >= MOST_IMAGES
             if not self._admission.accepts("image", t, self.time_s, is_repeated, is_full):
                 return []
             self._waiting.insert(at, (t, landmark, measured))
