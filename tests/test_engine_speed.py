@@ -29,3 +29,12 @@ def test_the_median_frame_of_the_engine_is_faster_than_that_of_the_reference_fil
         frames = list(zip(*(run_filter(ekf, problem.sequence, clock=process_time) for ekf in filters), strict=True))
     engine_ms, reference_ms = np.median([[frame.ms for frame in pair] for pair in frames[10:]], axis=0)
     assert LEAST_GAIN * engine_ms < reference_ms
+
+
+def test_a_frame_of_the_engine_takes_no_longer_late_in_a_drive_than_early():
+    """Views that only old landmarks depend on leave the matrix, which would grow by twelve columns a frame."""
+    problem = resolve(builtin("city?frames=160&max_tracks=30"))
+    ekf = JointEKF(problem.model, dataclasses.replace(problem.config.filter, engine="engine"))
+    with one_thread():
+        ms = [frame.ms for frame in run_filter(ekf, problem.sequence, clock=process_time)]
+    assert np.median(ms[-40:]) < 3.0 * np.median(ms[20:60])
