@@ -7,6 +7,7 @@ import json
 
 import numpy as np
 import pytest
+from support.helpers import synthetic_result, synthetic_sequence
 from support.running import WHOLE, seeds
 
 from ekfslam.data.sequence import Noise, Sequence
@@ -17,7 +18,7 @@ from ekfslam.evaluation.causes import Cause, truth_causes
 from ekfslam.evaluation.consistency import pose_error, pose_nees_by_axis
 from ekfslam.evaluation.honesty import Honesty, judge, require_innovations
 from ekfslam.figures.check import plot_check
-from ekfslam.filters.result import REASONS, Result, WhitenedInnovations
+from ekfslam.filters.result import OTHER, REASONS, Result, WhitenedInnovations
 from ekfslam.geometry import se3
 from ekfslam.geometry.camera import project
 from ekfslam.reports import compare
@@ -391,6 +392,16 @@ def test_values_table_and_figure_say_the_same(one_run):
     for ax in figure.axes:
         assert "[" in ax.get_xlabel() and "[" in ax.get_ylabel() and ax.get_title()
     assert found.verdict[:20] in figure.get_suptitle()
+
+
+def test_neither_a_truth_without_poses_nor_a_run_without_covariance_is_compared():
+    sequence = synthetic_sequence(frames=5)
+    result, truth = synthetic_result(sequence), sequence.truth
+    assert evidence.truth_agreement(result, truth, None) is not None
+    none = dataclasses.replace(truth, frame=truth.frame[:0], T_world_imu=truth.T_world_imu[:0])
+    assert evidence.truth_agreement(result, none, None) is None
+    unsure = dataclasses.replace(result, covariance=np.zeros_like(result.covariance), attributes={OTHER: "theirs"})
+    assert evidence.truth_agreement(unsure, truth, None) is None
 
 
 @pytest.mark.parametrize(

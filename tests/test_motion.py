@@ -7,6 +7,8 @@ import itertools
 import json
 import shutil
 import subprocess
+import sys
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -59,6 +61,14 @@ def test_a_viewer_file_holds_poses_landmarks_and_errors(path, tmp_path, capsys):
     target.write_text("mine")
     assert main(["plot", str(path), "--viewer", str(target)]) == 2
     assert "--force" in capsys.readouterr().err
+
+
+def test_positions_sent_to_the_viewer_are_those_of_the_imu(path, monkeypatch):
+    rerun, archive = MagicMock(), read_archive(path)
+    monkeypatch.setitem(sys.modules, "rerun", rerun)
+    viewer.log_archive(archive, MagicMock())
+    sent = [call.kwargs["translation"] for call in rerun.Transform3D.columns.call_args_list]
+    np.testing.assert_array_equal(sent, [result.T_world_imu[:, :3, 3] for result in archive.results.values()])
 
 
 def test_ellipsoids_have_the_axes_of_their_covariance():

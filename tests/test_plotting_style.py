@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import matplotlib as mpl
 import numpy as np
@@ -14,6 +15,7 @@ from PIL import Image
 
 from ekfslam import config
 from ekfslam.figures import style
+from ekfslam.figures.study import plot_study_errors
 from ekfslam.studies.study import STUDY_VARIANTS
 
 ROOT = Path(__file__).parents[1]
@@ -76,6 +78,21 @@ def test_files_keep_the_colour_of_large_areas(tmp_path, packed):
     written = np.asarray(Image.open(tmp_path / "a.png").convert("RGB"))
     grey = np.round(255 * np.array(to_rgb(style.BOUNDS["color"]))).astype(np.uint8)
     assert (written == grey).all(axis=-1).mean() > 0.2
+
+
+def test_errors_of_a_study_are_x_y_and_yaw_with_their_bounds():
+    rng = np.random.default_rng(0)
+    values = {"position_error": rng.normal(size=(3, 9, 3)), "rotation_error": rng.normal(size=(3, 9, 3))}
+    values["three_sigma"] = rng.uniform(1.0, 2.0, (3, 9, 6))
+    study = SimpleNamespace(
+        finished=lambda level: {"invariant": values}, time_s=lambda level: np.arange(9.0), done={"low": np.ones(3)}
+    )
+    drawn = [[line.get_ydata() for line in ax.lines] for ax in plot_study_errors(study, "low").axes]
+    turned = np.degrees(values["rotation_error"][..., 2])
+    for found, errors in zip(drawn, [*np.moveaxis(values["position_error"][..., :2], -1, 0), turned], strict=True):
+        np.testing.assert_allclose(found[:3], errors)
+    bounds = np.median(values["three_sigma"][..., [0, 1, 5]], axis=0).T * [[1.0], [1.0], [np.degrees(1.0)]]
+    np.testing.assert_allclose([found[-1] for found in drawn], bounds)
 
 
 def test_axes_above_each_other_share_their_view_and_the_ticks_of_the_lowest():
