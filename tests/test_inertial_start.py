@@ -120,6 +120,13 @@ def test_a_start_in_motion_finds_tilt_velocity_and_gyroscope_bias():
 
 
 @pytest.mark.slow
+def test_without_noise_gravity_in_motion_has_its_magnitude_to_a_centimetre_a_second_squared():
+    exact = Room(frames=50, seed=1, sigma_px=0.02, gyro=1e-6, accel=1e-5, accel_bias_std_m_s2=1e-4)
+    problem = resolve(simulate_room(exact)[30:])
+    assert "|g| 9.81 m/s^2 if free" in problem.account["inertial_start"]
+
+
+@pytest.mark.slow
 def test_a_filter_that_starts_in_motion_is_honest_from_the_first_frames_on():
     squared = []
     for seed in range(5):
