@@ -1,6 +1,7 @@
 """The first state of the inertial process."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,12 +9,15 @@ from inertial import nees as inertial_nees
 from inertial import true_values
 
 import ekfslam
+from ekfslam.config import FilterConfig
 from ekfslam.data.inputs import InertialNoise, InertialSamples
 from ekfslam.data.room import GRAVITY_M_S2, Room, simulate_room
+from ekfslam.data.sequence import of_left_camera
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import run_filter
 from ekfslam.filters.stretches import thinned
 from ekfslam.geometry import se3
+from ekfslam.inertial.noise import from_differences, likeliest_densities
 from ekfslam.models.inertial_start import FirstPrior, at_rest, image_motion, rest_of
 from ekfslam.resolve import resolve
 
@@ -164,3 +168,30 @@ def test_right_densities_stay_as_stated():
     problem = resolve(simulate_room(Room(frames=30, seed=1)))
     assert problem.account["inertial_noise"] == "as stated"
     assert problem.config.inertial.accel == 2e-3
+
+
+def likeliest(sequence, at, monkeypatch):
+    """Densities found if the log-likelihood of a stretch is a parabola about some of gyroscope and accelerometer."""
+
+    def run(noise, config, part, stretches):
+        off = np.log2([noise.gyro / at[0], noise.accel / at[1]])
+        return [SimpleNamespace(log_likelihood=-200.0 * float(off @ off))]
+
+    monkeypatch.setattr("ekfslam.inertial.noise.run_stretches", run)
+    return likeliest_densities(sequence, FilterConfig(), lambda part, noise: lambda densities: densities)
+
+
+@pytest.mark.parametrize("factors", [(0.7, 1.9), (3.1, 0.4)])
+def test_the_likeliest_densities_are_found_between_steps(factors, monkeypatch):
+    sequence = simulate_room(Room(frames=60, seed=1))
+    at = np.array(factors) * [sequence.inertial.noise.gyro, sequence.inertial.noise.accel]
+    found = likeliest(sequence, at, monkeypatch).noise
+    np.testing.assert_allclose([found.gyro, found.accel], at, rtol=0.02)
+
+
+@pytest.mark.parametrize(("factor", "is_found"), [(1.3, True), (1.7, False)])
+def test_densities_of_one_camera_that_exceed_what_samples_show_are_of_a_wrong_start(factor, is_found, monkeypatch):
+    sequence = of_left_camera(simulate_room(Room(frames=60, seed=1)))
+    upper = from_differences(sequence.inertial)
+    found = likeliest(sequence, (upper.gyro, factor * upper.accel), monkeypatch)
+    assert (found is not None) == is_found
