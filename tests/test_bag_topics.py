@@ -299,6 +299,25 @@ def test_swapped_images_and_odometry_are_sorted_and_counted(tmp_path):
     assert any("1 messages of /odom are before their pred" in note for note in found.notes)
 
 
+def test_images_without_stamps_have_those_of_writing(tmp_path):
+    bag = Written()
+    add(bag, "/left/image_raw", 0, 0.0)
+    add(bag, "/right/image_raw", 1, 0.1)
+    for side, topic in enumerate(("/left/image_raw", "/right/image_raw")):
+        messages = bag.topics[topic]
+        messages[:] = [(kind, s, image(0, side, picture(k, side))) for k, (kind, s, _) in enumerate(messages)]
+    found = open_images(write(tmp_path, bag))
+    np.testing.assert_allclose(np.diff(found.time_s), STEP_NS / 1e9, atol=1e-6)
+    np.testing.assert_array_equal(found.load(3)[1], picture(3, 1))
+    assert "Images of /left/image_raw have no stamps: the times of writing are taken." in found.notes
+
+
+def test_more_than_two_named_cameras_are_refused(tmp_path):
+    names = ["/zed/left/image_rect_color", "/zed/right/image_rect_color", "/zed/rgb/image_rect_color"]
+    with pytest.raises(CalibrationError, match="expected one or two topics of images"):
+        open_images(write(tmp_path, zed()), topics=names)
+
+
 def test_a_repeated_odometry_message_is_left_out_and_counted(tmp_path):
     def change(messages: list[Any]) -> None:
         kind, at, make = messages[4]

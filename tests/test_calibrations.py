@@ -165,6 +165,25 @@ def test_left_and_right_yaml_of_ros(tmp_path, given, model, coefficients, read):
     np.testing.assert_allclose(R1 @ q - R2 @ se3.apply(pair.T_right_left, q), [0.11, 0, 0], atol=1e-12)
 
 
+def test_camera_info_in_folders_of_both_sides(tmp_path):
+    for side, name in enumerate(("left", "right")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "camera_info.yaml").write_text(ros(side, "plumb_bob", D))
+    for name in ("left", "right"):
+        np.testing.assert_allclose(read_pair(tmp_path / name / "camera_info.yaml").pair().K_right, K(RIGHT))
+
+
+def test_files_of_one_camera_serve_one_camera(tmp_path):
+    (tmp_path / "ost.yaml").write_text(ros(0, "plumb_bob", D))
+    text = "%YAML:1.0\n" + orb_camera("Camera1", LEFT, ("k1", "k2", "p1", "p2"), D)
+    (tmp_path / "mono.yaml").write_text(f"{text}Camera.width: {SIZE[0]}\nCamera.height: {SIZE[1]}\n")
+    (tmp_path / "chain.yaml").write_text(chain(FORWARD).split("cam1:")[0])
+    for name in ("ost.yaml", "mono.yaml", "chain.yaml"):
+        lens = read_pair(tmp_path / name, ("/camera/image_raw",)).pair()
+        np.testing.assert_allclose(lens.K, K(LEFT))
+        np.testing.assert_allclose(lens.distortion.coefficients, D)
+
+
 def test_one_camera_of_ros_alone_is_a_named_error(tmp_path):
     (tmp_path / "left.yaml").write_text(ros(0, "plumb_bob", D))
     with pytest.raises(UnknownFormatError, match=r"left\.yaml: it has one camera, and no file beside it"):

@@ -6,11 +6,13 @@ import importlib.util
 import re
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from ekfslam.data.simulate import Loop, simulate
 from ekfslam.evaluation.consistency import chi2_bounds
@@ -192,47 +194,114 @@ def rendered(frames):
     return recording(frames, distorted=False, rotation_rad=np.zeros(3))
 
 
-def image_message(image, t):
-    height, width = image.shape
-    found = Message(encoding="mono8", data=image.tobytes(), height=height, width=width, step=width)
-    found.header.stamp = Message(sec=int(t), nanosec=round(1e9 * (t % 1.0)))
-    return found
+class Ros:
+    """Types of ROS 2 as rosbags knows them, with the defaults that rclpy gives."""
+
+    def __init__(self):
+        typesys = pytest.importorskip("rosbags.typesys")
+        self.store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+
+    def new(self, kind, **changes):
+        """A message with empty fields."""
+        found = {}
+        for name, (node, what) in self.store.fielddefs[kind][1]:
+            if node.name == "NAME":
+                found[name] = self.new(what)
+            elif node.name == "BASE":
+                found[name] = {"string": "", "bool": False}.get(what[0], 0.0 if "float" in what[0] else 0)
+            else:
+                found[name] = np.zeros(what[1]) if node.name == "ARRAY" else []
+        return self.store.types[kind](**{**found, **changes})
+
+    def stamped(self, kind, t, **changes):
+        found = self.new(kind, **changes)
+        found.header.stamp.sec, found.header.stamp.nanosec = divmod(round(1e9 * t), 10**9)
+        return found
+
+    def sent(self, message):
+        """A message as a subscriber gets it: what is no number of its type raises an error."""
+        kind = message.__msgtype__
+        for part in (message.pose, message.twist) if hasattr(message, "twist") else ():
+            part.covariance = np.array(part.covariance)
+        if kind.endswith("PoseWithCovarianceStamped"):
+            message.pose.covariance = np.array(message.pose.covariance)
+        return self.store.deserialize_cdr(self.store.serialize_cdr(message, kind), kind)
+
+
+KINDS = ["sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/Imu", "nav_msgs/msg/Odometry"]
+KINDS += [f"geometry_msgs/msg/{kind}" for kind in ("TwistStamped", "PoseWithCovarianceStamped", "TransformStamped")]
+KINDS += ["tf2_msgs/msg/TFMessage"]
+
+
+def seconds_of(header):
+    return header.stamp.sec + 1e-9 * header.stamp.nanosec
 
 
 @pytest.mark.slow
-def test_ros2_stereo(tmp_path):
-    """The node without ROS: images and velocities as ROS has them go in, and poses near the truth come out."""
+@pytest.mark.parametrize("topic", ["velocities", "wheels"])
+def test_ros2_stereo(tmp_path, topic):
+    """The node without ROS: images and velocities go in as messages of ROS 2, odometry and TF come out as such."""
     from support.rendered import BASELINE_M, PINHOLE, SIZE, T_CAM_BODY, drive
 
-    module, world = example("ros2_stereo"), rendered(12)
+    module, world, ros = example("ros2_stereo"), rendered(12), Ros()
     module.T_CAM_IMU = T_CAM_BODY
-    published, heard, said = [], {}, []
+    published, heard, said = {}, {}, []
     node = SimpleNamespace(
-        create_publisher=lambda kind, topic, depth: SimpleNamespace(publish=published.append),
+        create_publisher=lambda kind, topic, depth: SimpleNamespace(
+            publish=lambda message: published.setdefault(topic, []).append(ros.sent(message))
+        ),
         create_subscription=lambda kind, topic, callback, depth: heard.update({topic: callback}),
         get_logger=lambda: SimpleNamespace(warning=said.append, error=said.append),
     )
-    kinds = dict.fromkeys(("Image", "CameraInfo", "Imu", "TwistStamped", "PoseWithCovarianceStamped"), Message)
+    kinds = {kind.rpartition("/")[2]: partial(ros.new, kind) for kind in KINDS}
     slam = module.Slam(node, SimpleNamespace(**kinds), learn=4, delay_s=0.0, queue=12)
     P = np.hstack([PINHOLE, [[-300.0 * BASELINE_M], [0.0], [0.0]]])
-    heard["right/camera_info"](Message(p=P.ravel().tolist(), width=SIZE[0], height=SIZE[1]))
-    noise = 0.05 * np.random.default_rng(0).standard_normal((12, 6))
-    for k, t in enumerate(world.time_s.tolist()):
-        twist = Message()
-        twist.header.stamp = Message(sec=int(t), nanosec=round(1e9 * (t % 1.0)))
-        for part, values in (("linear", drive(12)[k, :3] + noise[k, :3]), ("angular", drive(12)[k, 3:])):
-            setattr(twist.twist, part, Message(**dict(zip("xyz", values.tolist(), strict=True))))
-        heard["velocities"](twist)
+    heard["right/camera_info"](ros.new(KINDS[1], p=P.ravel(), width=SIZE[0], height=SIZE[1]))
+    noise, first = 0.05 * np.random.default_rng(0).standard_normal((12, 6)), 1.7e9 + 0.123456789
+
+    def send(k, t):
+        message = ros.stamped("geometry_msgs/msg/TwistStamped" if topic == "velocities" else "nav_msgs/msg/Odometry", t)
+        inner = message.twist if topic == "velocities" else message.twist.twist
+        for part, values in ((inner.linear, drive(12)[k, :3] + noise[k, :3]), (inner.angular, drive(12)[k, 3:])):
+            part.x, part.y, part.z = values.tolist()
+        heard[topic](message)
         for side, image in zip(("left", "right"), world.load(k), strict=True):
-            heard[f"{side}/image_rect"](image_message(image, t))
+            size = {"height": image.shape[0], "width": image.shape[1], "step": image.shape[1]}
+            heard[f"{side}/image_rect"](
+                ros.stamped("sensor_msgs/msg/Image", t, encoding="mono8", data=image.ravel(), **size)
+            )
+
+    for k, t in enumerate((first + world.time_s).tolist()):
+        send(k, t)
         if k == 8:
             slam.stereo.flush()
     slam.stereo.flush()
+    assert said == [] and slam.stereo.live.counts.taken_in == 12 and slam.stereo.skipped == 0
+    t, T, covariance, _ = slam.stereo.pose()
+    send(11, first + world.time_s[-1])  # once more, which changes nothing but publishes the newest pose
+    assert slam.stereo.counts.late_images == 1
+    odometry, (transform,), pose = published["odometry"][-1], published["/tf"][-1].transforms, published["pose"][-1]
+    assert (odometry.header.frame_id, odometry.child_frame_id) == ("map", "base_link")
+    for header in (odometry.header, transform.header, pose.header):
+        assert seconds_of(header) == pytest.approx(t, abs=1e-6) and header.frame_id == "map"
+    place, turn = odometry.pose.pose.position, transform.transform.rotation
+    np.testing.assert_allclose([place.x, place.y, place.z], T[:3, 3])
+    R = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
+    np.testing.assert_allclose(R, T[:3, :3], atol=1e-9)
+    position, rotation = world_axes_covariance(T[None], covariance[None])
+    P = odometry.pose.covariance.reshape(6, 6)  # x y z, then about x y z, by rows
+    np.testing.assert_allclose(P[:3, :3], position[0], atol=1e-12)
+    np.testing.assert_allclose(P[3:, 3:], rotation[0], atol=1e-12)
+    error = T[:3, 3] - world.truth.T_world_imu[-1, :3, 3]
+    assert np.linalg.norm(error) < 0.2  # of 5.5 m
+    for k in range(12):  # the bag is played again
+        send(k, first - 100.0 + world.time_s[k])
+    assert len(said) >= 1 and slam.stereo.counts.resets >= 1
     slam.stereo.__exit__()
-    assert said == [] and len(published) >= 3 and slam.stereo.live.counts.taken_in == 12
-    T, T_true = slam.stereo.pose().T_world_imu, world.truth.T_world_imu[-1]
-    assert np.linalg.norm(T[:3, 3] - T_true[:3, 3]) < 0.2  # of 5.5 m
-    assert published[-1].header.frame_id == "map" and len(published[-1].pose.covariance) == 36
+
+
+def test_ros2_stereo_without_ros(tmp_path):
+    module = example("ros2_stereo")
     colours = Message(encoding="bgr8", data=bytes(range(24)), height=2, width=4, step=12)
     assert module.grey(colours)[0, 1] == round(0.114 * 3 + 0.587 * 4 + 0.299 * 5)
     if importlib.util.find_spec("rclpy") is None:

@@ -58,6 +58,18 @@ def test_names_without_leading_zeros_are_in_natural_order(tmp_path, step):
     assert first_values(found) == [10 * k for k in range(FRAMES)]
 
 
+@pytest.mark.parametrize("names", [("left_images", "right_images"), ("L", "R"), ("Left", "Right"), ("cam_l", "cam_r")])
+def test_folders_whose_names_differ_in_the_side_alone_are_a_pair(tmp_path, names):
+    folder = write_plain(tmp_path)
+    for side, name in zip(("left", "right"), names, strict=True):
+        (folder / side).rename(folder / name)
+    text = (folder / "calibration.toml").read_text()
+    (folder / "calibration.toml").write_text(text.split("\n", 2)[2])
+    (folder / names[0] / "._0001.png").write_bytes(b"of macOS")
+    assert first_values(opened(folder)) == [10 * k for k in range(FRAMES)]
+    assert first_values(opened(folder), 1) == [10 * k + 1 for k in range(FRAMES)]
+
+
 def test_names_that_are_seconds_are_in_the_order_of_time(tmp_path):
     names = ["9.5", "10.25", "10.3", "10.305", "11.0", "100.0"]
     found = opened(renamed(write_plain(tmp_path), lambda side, frame: f"{side}/{names[frame]}.png"))
@@ -172,7 +184,7 @@ def test_missing_parts_of_a_kitti_sequence_are_all_named(tmp_path):
         opened(folder)
     for name in ("image_0", "image_1"):
         shutil.rmtree(folder / name)
-    with pytest.raises(UnknownFormatError, match=r"lacks a pair of folders of images .*times\.txt.*labels"):
+    with pytest.raises(UnknownFormatError, match=r"lacks folders of images .*times\.txt.*labels"):
         opened(folder)
 
 

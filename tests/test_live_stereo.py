@@ -133,6 +133,45 @@ def test_an_error_in_a_thread_is_raised_by_the_next_call(pairs):
             stereo.flush()
 
 
+@pytest.mark.slow
+def test_pairs_that_are_dropped_under_load_widen_the_covariance_and_leave_the_pose_right(pairs):
+    """Velocities go on while the tracker misses five pairs: the interval is that of all of them."""
+    found, images = pairs
+    noise = 0.2 * np.random.default_rng(0).standard_normal((FRAMES, 6)) * [1, 1, 1, 0.02, 0.02, 0.02]
+    twist, lost = drive(FRAMES) + noise, range(9, 14)
+    stereos = {name: new(found, queue=1) for name in ("whole", "loaded")}
+    growth = {}
+    for name, stereo in stereos.items():
+        std = []
+        for k, t in enumerate(found.time_s.tolist()):
+            stereo.velocities(twist[k], t)
+            if name == "whole" or k not in lost:
+                stereo.images(*images[k], t)
+            if k in (8, 13):
+                stereo.flush()
+                std.append(np.trace(stereo.live.pose(t).covariance[:3, :3]))
+        stereo.flush()
+        growth[name] = std[1] - std[0]
+    whole, loaded = (stereo.live.pose() for stereo in stereos.values())
+    apart = se3.log(se3.inverse(whole.T_world_imu) @ loaded.T_world_imu)
+    assert (np.abs(apart) < 2.0 * np.sqrt(np.diag(loaded.covariance))).all()
+    assert growth["loaded"] > 1.5 * growth["whole"] > 0
+    assert stereos["loaded"].live.counts.taken_in == FRAMES - len(lost)
+
+
+@pytest.mark.slow
+def test_pairs_that_come_too_fast_for_the_tracker_are_counted(pairs):
+    found, images = pairs
+    with new(found, queue=1) as stereo:
+        for k, t in enumerate(found.time_s.tolist()):
+            stereo.velocities(drive(FRAMES)[k], t)
+            stereo.images(*images[k], t)
+            if k == 7:
+                stereo.flush()
+        stereo.flush()
+    assert stereo.skipped > 0 and stereo.live.counts.taken_in + stereo.skipped == FRAMES
+
+
 def test_pairs_beyond_the_queue_displace_the_oldest():
     tracked, has_begun, may_go = [], threading.Event(), threading.Event()
 

@@ -12,9 +12,10 @@ from support.bags import FIRST_NS, STEP_NS, odometry, stereo, write
 from support.recordings import FRAMES, HEADER, ece276a_fields, stamps, write_npz
 
 from ekfslam import attach_truth, open_images, open_sequence
+from ekfslam.data.readers.euroc import read_euroc
 from ekfslam.data.sequence import Truth
 from ekfslam.data.simulate import builtin
-from ekfslam.errors import StampError, TruthError
+from ekfslam.errors import NonFiniteError, StampError, TruthError
 from ekfslam.evaluation.sanity import inspect_sequence
 from ekfslam.geometry import se3
 
@@ -68,6 +69,8 @@ FILES = {
         "field.pose.pose.orientation.w,field.other",
         POSE, "ns", further=1,
     ),
+    "semicolons": text("time;x;y;z;qx;qy;qz;qw", POSE, separator=";"),
+    "semicolons and decimal commas": text("time;x;y;z;qx;qy;qz;qw", POSE, separator=";").replace(".", ","),
     "quaternion first": text("time,qw,qx,qy,qz,px,py,pz", "qw qx qy qz x y z"),
 }  # fmt: skip
 
@@ -150,6 +153,7 @@ PLANAR: dict[str, Callable[[float], str]] = {
     "t v_x w_z\n": lambda t: f"{t:.6f} 2.0 0.1",
     "# time,w_z,v_x\n": lambda t: f"{t:.6f},0.1,2.0",
     "# frame: imu\n# time [s], v_x [m/s], note, w_z [rad/s]\n": lambda t: f"{t:.6f}, 2.0, 9, 0.1",
+    "time;v_x;w_z\n": lambda t: f"{t:.6f};2.0;0.1".replace(".", ","),
     "time,vx,vy,vz,wx,wy,wz\n": lambda t: f"{t:.6f},2.0,0,0,0,0,0.1",
 }
 
@@ -160,6 +164,23 @@ def test_two_velocities_of_a_planar_robot_are_enough(npz, tmp_path, header):
     found = with_velocities(tmp_path, header + "".join(f"{PLANAR[header](t)}\r\n" for t in times))
     np.testing.assert_allclose(found.twist, np.tile([2.0, 0, 0, 0, 0, 0.1], (FRAMES, 1)), atol=1e-12)
     assert found.measured_axes.tolist() == [True, False, False, False, False, True]
+
+
+@pytest.mark.parametrize(("unit", "second"), [("milli", 1e3), ("micro", 1e6), ("nano", 1e9)])
+def test_stamps_of_velocities_in_another_unit_are_named(npz, tmp_path, unit, second):
+    lines = "".join(f"{int((1.7e9 + 0.05 * k) * second)} 2.0 0.1\n" for k in range(200))
+    with pytest.raises(NonFiniteError, match=f"{unit}seconds"):
+        with_velocities(tmp_path, lines)
+
+
+def test_stamps_in_ns_may_count_from_0(npz, tmp_path):
+    first = NS[0]
+    content = FILES["euroc"]
+    for stamp in NS:
+        content = content.replace(str(stamp), str(stamp - first))
+    (tmp_path / "data.csv").write_text(content)
+    found = read_euroc(tmp_path / "data.csv")
+    np.testing.assert_allclose(found.time_s, (NS - first) / 1e9)
 
 
 def test_repeated_velocities_are_left_out_and_counted(npz, tmp_path):

@@ -38,12 +38,16 @@ def twist_of(message: Any) -> Array:
     return np.array([linear.x, linear.y, linear.z, angular.x, angular.y, angular.z])
 
 
+def placed(place: Any, turn: Any, T: Array) -> None:
+    """Fill a Point or Vector3 and a Quaternion with a pose."""
+    place.x, place.y, place.z = T[:3, 3].tolist()
+    turn.x, turn.y, turn.z, turn.w = Rotation.from_matrix(T[:3, :3]).as_quat().tolist()
+
+
 def filled(out: Any, stamp: Any, T_world_imu: Array, covariance: Array) -> Any:
-    """Fill a PoseWithCovarianceStamped with a pose and the covariance (6, 6) of its ``xi``, and return it."""
+    """Fill a PoseWithCovarianceStamped or Odometry with a pose and the covariance (6, 6) of its ``xi``; return it."""
     out.header.stamp, out.header.frame_id = stamp, "map"
-    place, turn = out.pose.pose.position, out.pose.pose.orientation
-    place.x, place.y, place.z = T_world_imu[:3, 3].tolist()
-    turn.x, turn.y, turn.z, turn.w = Rotation.from_matrix(T_world_imu[:3, :3]).as_quat().tolist()
+    placed(out.pose.pose.position, out.pose.pose.orientation, T_world_imu)
     R = np.kron(np.eye(2), T_world_imu[:3, :3])
     out.pose.covariance = (R @ covariance @ R.T).ravel().tolist()
     return out

@@ -1,9 +1,11 @@
-"""A ROS 2 node on images: a rectified pair and an IMU, or velocities, in; the pose with its covariance out.
+"""A ROS 2 node on images: a rectified pair and an IMU, or velocities, in; odometry with its covariance and TF out.
 
 - ``/left/image_rect``, ``/right/image_rect`` (sensor_msgs/Image): mono8, rgb8 or bgr8; stamps at most 5 ms apart.
 - ``/right/camera_info`` (sensor_msgs/CameraInfo): its P has focal length, principal point and baseline.
-- ``/imu`` (sensor_msgs/Imu), or ``/velocities`` (geometry_msgs/TwistStamped) of the body. Use one of them, or none.
-- ``/pose`` (geometry_msgs/PoseWithCovarianceStamped): at every pair, along the axes of the map.
+- ``/imu`` (sensor_msgs/Imu), or ``/velocities`` (geometry_msgs/TwistStamped) or ``/wheels`` (nav_msgs/Odometry) of the
+  body. Use one of them, or none.
+- ``/pose`` (geometry_msgs/PoseWithCovarianceStamped), ``/odometry`` (nav_msgs/Odometry) and ``/tf`` (map to `BODY`): at
+  every pair, with the stamp of the pose; covariances along the axes of the map, position first.
 
 Callbacks may run in several threads (`MultiThreadedExecutor`). If a clock jumps, as when a bag is played again, the
 node starts again. It needs `ros2_node.py` beside it.
@@ -15,7 +17,7 @@ import sys
 from typing import Any
 
 import numpy as np
-from ros2_node import filled, seconds, twist_of
+from ros2_node import filled, placed, seconds, twist_of
 
 from ekfslam import LiveStereo
 from ekfslam.data.images import Image, PairCalibration, side_by_side
@@ -25,7 +27,9 @@ from ekfslam.errors import ClockError, EkfslamError
 # Yours instead: IMU to left optical frame, and the densities of the unit (imu.yaml of Kalibr).
 T_CAM_IMU = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 IMU_NOISE = InertialNoise(gyro=2e-4, accel=2e-3, gyro_walk=2e-5, accel_walk=3e-3)
+BODY = "base_link"  # frame of the body: the IMU, or that of the velocities
 PAIR_S = 0.005
+UNKNOWN = 1e6  # variance of a twist that is not estimated
 
 
 def grey(message: Any) -> Image:
@@ -50,20 +54,23 @@ class Slam:
 
     Args:
         node: Of rclpy.
-        messages: Types ``Image``, ``CameraInfo``, ``Imu``, ``TwistStamped`` and ``PoseWithCovarianceStamped``.
+        messages: Types ``Image``, ``CameraInfo``, ``Imu``, ``TwistStamped``, ``PoseWithCovarianceStamped``,
+            ``Odometry``, ``TFMessage`` and ``TransformStamped``.
         settings: Further arguments of `LiveStereo`.
     """
 
     def __init__(self, node: Any, messages: Any, **settings: Any) -> None:
         self.stereo: LiveStereo | None = None
-        self._settings, self._message, self._log = settings, messages.PoseWithCovarianceStamped, node.get_logger()
-        self._publisher = node.create_publisher(self._message, "pose", 10)
+        self._settings, self._messages, self._log = settings, messages, node.get_logger()
+        outputs = {"pose": messages.PoseWithCovarianceStamped, "odometry": messages.Odometry, "/tf": messages.TFMessage}
+        self._publish = {topic: node.create_publisher(kind, topic, 10).publish for topic, kind in outputs.items()}
         self._last: dict[str, tuple[float, Image]] = {}
         node.create_subscription(messages.CameraInfo, "right/camera_info", self.on_info, 10)
         node.create_subscription(messages.Image, "left/image_rect", lambda m: self.on_image("left", m), 10)
         node.create_subscription(messages.Image, "right/image_rect", lambda m: self.on_image("right", m), 10)
         node.create_subscription(messages.Imu, "imu", self.on_imu, 1000)
         node.create_subscription(messages.TwistStamped, "velocities", self.on_velocities, 1000)
+        node.create_subscription(messages.Odometry, "wheels", self.on_wheels, 1000)
 
     def on_info(self, message: Any) -> None:
         """Start when the calibration is known."""
@@ -95,6 +102,11 @@ class Slam:
         if self.stereo is not None:
             self._take(self.stereo.velocities, twist_of(message), seconds(message.header.stamp))
 
+    def on_wheels(self, message: Any) -> None:
+        """Take the velocity of an odometry."""
+        if self.stereo is not None:
+            self._take(self.stereo.velocities, twist_of(message.twist), seconds(message.header.stamp))
+
     def _take(self, call: Any, *arguments: Any) -> None:
         """Give a message to the filter; start again after a jump of the clock, and log other errors."""
         assert self.stereo is not None
@@ -109,23 +121,34 @@ class Slam:
     def publish(self, message: Any) -> None:
         """Publish the newest pose."""
         assert self.stereo is not None
-        _, T, covariance, _ = self.stereo.pose()
-        self._publisher.publish(filled(self._message(), message.header.stamp, T, covariance))
+        t, T, covariance, _ = self.stereo.pose()
+        stamp, own = message.header.stamp, self._messages
+        stamp.sec, stamp.nanosec = divmod(round(1e9 * t), 10**9)
+        self._publish["pose"](filled(own.PoseWithCovarianceStamped(), stamp, T, covariance))
+        odometry = filled(own.Odometry(), stamp, T, covariance)
+        odometry.child_frame_id, odometry.twist.covariance = BODY, (UNKNOWN * np.eye(6)).ravel().tolist()
+        self._publish["odometry"](odometry)
+        transform = own.TransformStamped()
+        transform.header.stamp, transform.header.frame_id, transform.child_frame_id = stamp, "map", BODY
+        placed(transform.transform.translation, transform.transform.rotation, T)
+        self._publish["/tf"](own.TFMessage(transforms=[transform]))
 
 
 def main() -> None:
     try:
         import rclpy
-        from geometry_msgs.msg import PoseWithCovarianceStamped, TwistStamped
+        from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped, TwistStamped
+        from nav_msgs.msg import Odometry
         from rclpy.executors import MultiThreadedExecutor
         from sensor_msgs.msg import CameraInfo, Image, Imu
+        from tf2_msgs.msg import TFMessage
     except ImportError as error:
         sys.exit(f"this node needs ROS 2, sourced in this shell: {error}")
     from types import SimpleNamespace
 
     rclpy.init()
     node = rclpy.create_node("ekfslam")
-    types = (Image, CameraInfo, Imu, TwistStamped, PoseWithCovarianceStamped)
+    types = (Image, CameraInfo, Imu, TwistStamped, PoseWithCovarianceStamped, Odometry, TFMessage, TransformStamped)
     Slam(node, SimpleNamespace(**{kind.__name__: kind for kind in types}))
     rclpy.spin(node, MultiThreadedExecutor())
 

@@ -117,6 +117,9 @@ def _cameras(bag: Bag) -> list[Camera]:
     infos = {parts_of(connection.topic)[0]: connection for connection in bag.connections(CAMERA_INFO)}
     streams = bag.connections(IMAGE, COMPRESSED)
     named = [stream for stream in streams if stream.topic in bag.named]
+    if len(named) > 2:
+        found = printable(", ".join(stream.topic for stream in named))
+        raise CalibrationError(f"expected one or two topics of images, found {found}", field="topics")
     best: dict[str, Any] = {}
     for stream in named or [stream for stream in streams if not _NO_PICTURES.search(stream.topic)]:
         space = stream.topic if named else parts_of(stream.topic)[0]
@@ -234,7 +237,11 @@ def places_of(camera: Camera) -> tuple[IntArray, int, tuple[str, ...]]:
             largest = max(largest, messages.largest_value(bag.message(camera.stream, content)))
     if not found:
         raise LostDataError("there is no message", field=topic)
-    rows, notes = in_order_of_stamps(np.array(found, dtype=np.int64), 1, f"images of {topic}")
+    table, said = np.array(found, dtype=np.int64), tuple[str, ...]()
+    if len(table) > 1 and not table[:, 1].any():
+        table[:, 1], said = table[:, 0], (f"Images of {topic} have no stamps: the times of writing are taken.",)
+    rows, notes = in_order_of_stamps(table, 1, f"images of {topic}")
+    notes += said
     bits = max(largest.bit_length(), 8) if is_deep else 16
     if is_deep:
         notes += (f"Images of 16 bits of {topic} use {bits}, by the largest value: the upper eight of these are kept.",)

@@ -67,7 +67,7 @@ class BagPairs:
             if connection.topic != topic:
                 continue
             for _, content in bag.raw(connection, written_ns, written_ns + 1):
-                if bag.stamp_ns(content) == stamp_ns:
+                if bag.stamp_ns(content) in (stamp_ns, 0):  # 0: without stamps
                     message, source = bag.message(connection, content), f"{self.path}: {printable(topic)}"
                     return messages.gray_of(message, source, self.size, self.bits)
         raise LostDataError(f"the image at {stamp_ns} ns is gone", source=str(self.path), field=printable(topic))

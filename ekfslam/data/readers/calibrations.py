@@ -295,6 +295,9 @@ def _openvins(read: Calibration) -> PairFile:
 def _ros(read: Calibration) -> PairFile:
     """Read the file of one side and that of the other, whose names differ in the side alone."""
     side, other = side_of(read.path.stem), other_side(read.path)
+    folder = other_side(read.path.parent.resolve()) if side is None else None
+    if folder is not None and (folder / read.path.name).is_file():
+        side, other = side_of(read.path.parent.resolve().name), folder / read.path.name
     if side is None or other is None:
         return PairFile(_ros_camera(read), None, np.eye(4), (read.path,))
     reads = (read, read_yaml(other)) if side == 0 else (read_yaml(other), read)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +28,7 @@ NAMES: dict[str, str] = {
 }
 NAMES |= dict.fromkeys(("time", "timestamp", "t", "stamp", "times", "timestamps", "sec", "seconds"), "time")
 _UNITS = {"ns": 1e-9, "nsec": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0, "sec": 1.0}
+_STEPS = (100_000, 1000)  # least steps of stamps that count from 0 in ns (0.1 ms) and in us (1 ms)
 _PREFIXES = ("field", "headerstamp", "header", "pose", "twist", "msg", "data")
 _HEADER_WITHIN, _LONGEST_HEADER = 20, 5000  # lines, characters
 POSE = ("time", "x", "y", "z", "qx", "qy", "qz", "qw")
@@ -59,18 +61,23 @@ def header_of(lines: list[str]) -> Header | None:
             continue
         rows = [row for row in lines[number + 1 :][:_HEADER_WITHIN] if row.strip() and not row.lstrip().startswith("#")]
         separator = "," if "," in next(iter(rows), line) else None
-        second = _second(words[place["time"]], rows[0].split(separator)[place["time"] :] if rows else [])
+        second = _second(words[place["time"]], [row.split(separator)[place["time"] :] for row in rows])
         return Header(place, len(words), number + 1, separator, second)
     return None
 
 
-def _second(name: str, first: list[str]) -> float:
-    """Return the length of the unit of stamps, s: as the header says, or by the size of the first one since 1970."""
+def _second(name: str, rows: list[list[str]]) -> float:
+    """Return the length of the unit of stamps, s: as the header says, or by the steps or the first of whole numbers."""
     unit = re.search(r"[\[(](\w+)[\])]|_([num]?s)$", name)
     if unit is not None:
         return _UNITS.get(next(group for group in unit.groups() if group), 1.0)
-    digits = len(first[0].strip()) if first and first[0].strip().isdecimal() else 0
-    return next((second for least, second in ((18, 1e-9), (15, 1e-6), (12, 1e-3)) if digits >= least), 1.0)
+    words = [row[0].strip() for row in rows if row]
+    if not words or not all(word.isdecimal() for word in words):
+        return 1.0
+    digits, stamps = len(words[0]), [int(word) for word in words]
+    step = min((later - earlier for earlier, later in pairwise(stamps) if later > earlier), default=0)
+    limits = ((18, _STEPS[0], 1e-9), (15, _STEPS[1], 1e-6), (12, np.inf, 1e-3))
+    return next((second for least, longest, second in limits if digits >= least or step >= longest), 1.0)
 
 
 def _canonical(word: str) -> str | None:

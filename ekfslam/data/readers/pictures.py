@@ -162,7 +162,7 @@ def images_in(folder: Path) -> tuple[Path, ...]:
     """Return the image files of a folder in the natural order of their names: 2 before 10."""
     if not folder.is_dir():
         raise UnknownFormatError(f"{folder}: this folder of images is missing")
-    found = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES]
+    found = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and not path.name.startswith(".")]
     if not found:
         raise UnknownFormatError(f"{folder}: there are no images")
     is_decimal = all(re.fullmatch(r"\d+\.\d+", path.stem, re.ASCII) for path in found)
@@ -180,6 +180,12 @@ def find_pair(folder: Path) -> tuple[str, str] | None:
     for pair in PAIRS:
         if all((folder / name).is_dir() for name in pair):
             return pair
+    places = sorted(path for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
+    folders = [place.name for place in places if any(path.suffix.lower() in SUFFIXES for path in place.iterdir())]
+    for left in folders:
+        wanted = without_side(left, 0)
+        if wanted is not None and (rights := [name for name in folders if without_side(name, 1) == wanted]):
+            return left, rights[0]
     names = [path.stem for path in folder.iterdir() if path.suffix.lower() in SUFFIXES] if folder.is_dir() else []
     return (".", ".") if all(any(side.search(name) for name in names) for side in _SIDES) else None
 
@@ -214,7 +220,7 @@ def side_of(name: str) -> int | None:
 
 def without_side(name: str, side: int) -> str | None:
     """Return a name of a side without it, which is equal for both sides of a pair; None for other names."""
-    return _SIDES[side].sub("*", name) if side_of(name) == side else None
+    return _SIDES[side].sub("*", name).lower() if side_of(name) == side else None
 
 
 def other_side(path: Path) -> Path | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,7 @@ from ekfslam.errors import CalibrationError, DataError, LineError, NonFiniteErro
 from ekfslam.limits import require_file
 
 Converters = Mapping[int, Callable[[str], float]]
+_NUMBERS = re.compile(r"[\d\s.,;eE+-]+")
 Where = dict[str, Any]  # keyword arguments of a `DataError`
 
 
@@ -42,11 +44,20 @@ class Table:
             raise StampError("the stamp does not increase", **self.where(int(np.argmax(backwards)) + 1))
 
 
+def with_commas(line: str) -> str:
+    """Return a line with commas in place of semicolons, and points in place of the decimal commas beside these."""
+    if ";" not in line:
+        return line
+    if "," not in line:
+        return line.replace(";", ",")
+    return line.replace(",", ".").replace(";", ",") if _NUMBERS.fullmatch(line) else line
+
+
 def read_lines(path: Path, expected: str) -> list[str]:
     """Return the lines of a text file."""
     try:
         require_file(path, is_text=True)
-        return path.read_text(encoding="utf-8-sig").splitlines()
+        return [with_commas(line) for line in path.read_text(encoding="utf-8-sig").splitlines()]
     except (OSError, UnicodeDecodeError, UnknownFormatError) as error:
         raise UnknownFormatError(f"{path}: not a readable text file ({error}); {expected}") from None
 
@@ -64,7 +75,7 @@ def first_row(path: Path, comment: str | None = "#") -> str:
     try:
         require_file(path, is_text=True)
         with path.open(encoding="utf-8-sig", errors="replace") as file:
-            return next((content for _, content in rows_of(file, comment)), "")
+            return with_commas(next((content for _, content in rows_of(file, comment)), ""))
     except (OSError, UnknownFormatError):
         return ""
 

@@ -13,6 +13,7 @@ from typing import cast, get_args
 
 import numpy as np
 
+from ekfslam.data.checks import spelled_as_in, validate_stamps
 from ekfslam.data.inputs import VelocityFrame, VelocitySamples
 from ekfslam.data.readers.columns import TWIST, Header, header_of, read_named, without_repeats
 from ekfslam.data.readers.fields import checksum
@@ -66,6 +67,8 @@ def _inputs(source: Source) -> VelocitySamples:
     if not len(table.values):
         raise UnknownFormatError(f"{path}: holds no velocities; expected {READER.expected}")
     table, repeated = without_repeats(table)
+    with spelled_as_in(str(path)):
+        validate_stamps(table.values[:, 0])
     frame = cast(VelocityFrame, stated or "imu")
     unsaid = f"{path.name} does not say in which frame its velocities are: they are taken as imu."
     notes = repeated if stated else (*repeated, unsaid)
