@@ -38,11 +38,6 @@ poses = pytest.mark.parametrize("T", POSES.values(), ids=POSES.keys())
 parameters = pytest.mark.parametrize("c", [np.zeros(9), C, -C], ids=["none", "some", "others"])
 
 
-def seen(T, c, m):
-    rows = seen_rows(T, c, TWIST, m)
-    return rows.reshape(*rows.shape[:-2], -1)
-
-
 def linearised(T, c, m, linear):
     """Points, rows by pose and parameters (n, 3, 15), rows by landmarks."""
     seen = see(observer_of(T, ALL), Moment(T, T, c, TWIST), m, linear)
@@ -57,20 +52,6 @@ def points(T, c):
     """World points in front of the camera as it is with parameters c."""
     before = se3.exp(-c[8] * TWIST) @ T
     return visible_points(se3.inverse(T_CAM_IMU) @ se3.exp(c[:6]) @ T_CAM_IMU @ before)
-
-
-@parameters
-@poses
-def test_measurement_jacobians_by_pose_parameters_and_landmark(T, c):
-    m = points(T, c)
-    q, H, H_m = linearised(T, c, m, m)
-    predicted = cal.calibrated(RIG, c).predict(q)
-    np.testing.assert_allclose(predicted, seen_rows(T, c, TWIST, m), rtol=1e-11)
-    both = stencil(lambda e: seen(se3.exp(e[..., :6]) @ T, c + e[..., 6:], m), 15)
-    np.testing.assert_allclose(H.reshape(-1, 15), both, rtol=1e-7, atol=1e-6)
-    for i in range(len(m)):
-        by_landmark = stencil(lambda d, i=i: seen(T, c, m[i] + d[..., None, :]), 3)
-        np.testing.assert_allclose(H_m[i], by_landmark, rtol=1e-7, atol=1e-6)
 
 
 @poses

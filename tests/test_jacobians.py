@@ -5,14 +5,11 @@ States: random, near the identity, and near half turns; extrinsics far from triv
 
 import numpy as np
 import pytest
-from support.jacobians import POSES, RNG, TWISTS, central, measurement_jacobian, transition_jacobian, visible_points
+from support.jacobians import POSES, RNG, TWISTS, central, visible_points
 from support.reference import CAMERA, T_CAM_IMU, jacobian_of_pi, small_world, stereo_matrix, triangulate_least_squares
 
-from ekfslam.config import FilterConfig
-from ekfslam.data.interval import Interval
 from ekfslam.data.sequence import Noise
 from ekfslam.filters.gaussian import Gaussian
-from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.variants import VARIANTS
 from ekfslam.geometry import camera as cam
 from ekfslam.geometry import motion, se3
@@ -72,38 +69,6 @@ def test_measurement_jacobians_by_pose_and_landmark(T):
     for i in range(len(m)):
         by_landmark = central(lambda d, i=i: rows(T, m[i : i + 1] + d), 3)
         np.testing.assert_allclose(H_m[i], by_landmark, rtol=1e-5, atol=1e-4)
-
-
-@poses
-@pytest.mark.parametrize("variant", ["invariant", "standard"])
-def test_full_width_jacobians_of_a_shuffled_non_first_subset(T, variant):
-    """The sparse H and F, seen through the state's retraction, with unseen landmarks before, between and behind."""
-    ekf = JointEKF(RIG, FilterConfig(variant=variant, landmark_coordinates="xyz", retire="never"), se3.inverse(T))
-    m = visible_points(T, 6)
-    ids = np.array([40, 3, 17, 99, 8, 21])
-    pixels = cam.project(CAMERA, se3.apply(T_CAM_IMU @ T, m))
-    ekf.update(0, ids, pixels)
-    seen = np.array([21, 3, 99])
-    at = [ekf.ids.tolist().index(i) for i in seen]
-
-    def predicted(error):
-        moved = ekf.positions_m + error[6:].reshape(-1, 3)
-        return rows(se3.exp(error[:6]) @ ekf.T_imu_world, moved[at])
-
-    H = measurement_jacobian(ekf, seen)
-    assert H.shape == (9, 24)
-    assert H.nnz <= 9 * 9
-    np.testing.assert_allclose(H.toarray(), central(predicted, 24), rtol=1e-5, atol=1e-4)
-
-    twist, tau = TWISTS[2], 0.13
-    E = motion.increment(twist, tau)
-
-    def propagated(error):
-        T_next = E @ se3.exp(error[:6]) @ ekf.T_imu_world
-        return np.concatenate([se3.log(T_next @ se3.inverse(E @ ekf.T_imu_world)), error[6:]])
-
-    F = transition_jacobian(ekf, Interval.of_one(twist, tau))
-    np.testing.assert_allclose(F.toarray(), central(propagated, 24), rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize("twist", TWISTS)

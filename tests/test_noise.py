@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.gauge import gauge_directions
 from support.helpers import grown, run_joint, tracked
-from support.jacobians import central, measurement_jacobian, transition_jacobian
+from support.jacobians import central
 from support.literal import Literal, filter_of, side_by_side
 from support.reference import small_world
 from support.running import WHOLE, seeds
@@ -20,7 +20,6 @@ from ekfslam.data.sequence import Observations
 from ekfslam.data.simulate import builtin
 from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import run_filter
-from ekfslam.filters.observing import observe
 from ekfslam.filters.result import REASONS
 from ekfslam.geometry import motion, se3
 from ekfslam.models.noise import (
@@ -227,36 +226,6 @@ def test_filter_with_velocities_and_errors_of_tracks_equals_the_literal_one(vari
     follow, again = side_by_side(ekf, literal, world, 1e-9, frames=15)
     assert len(ekf.ids) > 10
     assert follow > 50 and again > 5
-
-
-@pytest.mark.parametrize("tracks", [{}, TRACKS], ids=["white", "tracks"])
-def test_transition_and_measurement_jacobians_know_of_the_velocities(tracks):
-    world, config = (
-        with_noise(small_world(), twist_walk_std=WALK, **tracks),
-        dataclasses.replace(STILL, engine="reference"),
-    )
-    ekf = JointEKF(Rig(world.camera, world.T_cam_imu, world.noise), config, world.initial_T_world_imu, P0)
-    for _ in run_filter(ekf, world, range(3)):
-        pass
-    at = ekf.model.layout["twist"]
-    F = transition_jacobian(ekf, Interval.of_one(ekf.values["twist"], 0.1)).toarray()
-    np.testing.assert_allclose(F[:6, at], -motion.twist_jacobian(ekf.values["twist"], 0.1))
-    np.testing.assert_array_equal(F[6:], np.eye(len(F))[6:])
-    N = gauge_of_all(ekf)
-    H = measurement_jacobian(ekf, ekf.ids)
-    assert np.abs(H @ N).max() < 1e-9 * np.abs(H.toarray()).max() * np.abs(N).max()
-    if not tracks:
-        return
-    # Differences from the frame before see the gauge no more than the rows themselves.
-    ekf.predict(world.twist[3], 0.1)
-    seen_then = np.isin(ekf.ids, world.observations.at(2)[0])
-    _, rows = observe(ekf, ekf.mean, np.arange(len(ekf.ids)), ekf.table.seen_rows)
-    N = gauge_of_all(ekf)
-    by = rows.H_x @ N[: ekf.gaussian.seen] + rows.H_m @ N[ekf.gaussian.body :].reshape(-1, 3, 6)
-    assert np.abs(by).max() < 1e-9 * np.abs(rows.H_x).max() * np.abs(N).max()
-    differs = np.abs(rows.H_x[..., ekf.model.layout["previous_view"]]).max(axis=(1, 2)) > 0
-    np.testing.assert_array_equal(differs, seen_then)
-    assert differs.sum() > 3
 
 
 def gauge_of_all(ekf):

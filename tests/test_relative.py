@@ -22,112 +22,11 @@ from ekfslam.evaluation.relative import (
     relative_pose_nees,
 )
 from ekfslam.evaluation.summary import summarise
-from ekfslam.filters.gaussian import Gaussian, Rows
 from ekfslam.filters.result import PosePairs
 from ekfslam.geometry import motion
 from ekfslam.runner import run
 from ekfslam.smoother.posterior import posterior, smooth
 from ekfslam.storage.archive import open_result, write_archive
-
-BODY, CONSIDERED, LANDMARKS, SEEN = 8, 12, 3, 6
-
-
-def considered_gaussian(rng):
-    """A covariance of body, considered columns and landmarks, and which columns are estimated."""
-    gaussian = Gaussian(np.eye(BODY), SEEN)
-    assert gaussian.consider(CONSIDERED) == BODY
-    size = BODY + CONSIDERED + 3 * LANDMARKS
-    root = rng.normal(size=(size, size))
-    gaussian.replace(root @ root.T)
-    estimated = np.ones(size, dtype=bool)
-    estimated[BODY : BODY + CONSIDERED] = False
-    return gaussian, gaussian.P.copy(), estimated
-
-
-def some_rows(rng, k=2):
-    return Rows(
-        np.array([2, 0]),
-        rng.normal(size=(k, 3, SEEN)),
-        rng.normal(size=(k, 3, 3)),
-        rng.normal(size=(k, 3)),
-        rng.uniform(0.5, 2.0, (k, 3)),
-    )
-
-
-def full_jacobian(rows):
-    H = np.zeros((rows.residual.size, BODY + CONSIDERED + 3 * LANDMARKS))
-    for i, slot in enumerate(rows.slot):
-        start = BODY + CONSIDERED + 3 * slot
-        H[3 * i : 3 * i + 3, :SEEN], H[3 * i : 3 * i + 3, start : start + 3] = rows.H_x[i], rows.H_m[i]
-    return H
-
-
-# The verbs of the covariance
-
-
-def test_conditioning_is_that_of_schmidt_and_kalman():
-    rng = np.random.default_rng(0)
-    gaussian, P, estimated = considered_gaussian(rng)
-    rows = some_rows(rng)
-    H, R = full_jacobian(rows), np.diag(rows.variance.ravel())
-    # The gain of what is considered is zero; any gain has the covariance (I - K H) P (I - K H)^T + K R K^T.
-    K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
-    K[~estimated] = 0.0
-    naive = (np.eye(len(P)) - K @ H) @ P @ (np.eye(len(P)) - K @ H).T + K @ R @ K.T
-    solution = gaussian.solve(gaussian.project(rows, 0, np.arange(2)), 0, np.arange(2))
-    gaussian.apply(solution)
-    np.testing.assert_allclose(gaussian.P, naive, atol=1e-10)
-    np.testing.assert_array_equal(gaussian.P[np.ix_(~estimated, ~estimated)], P[np.ix_(~estimated, ~estimated)])
-    np.testing.assert_allclose(solution.done.correction, K @ rows.residual.ravel(), atol=1e-10)
-
-
-def test_rows_of_the_body_alone():
-    rng = np.random.default_rng(1)
-    gaussian, P, _ = considered_gaussian(rng)
-    H, r = rng.normal(size=(2, BODY)), rng.normal(size=2)
-    wide = np.hstack([H, np.zeros((2, len(P) - BODY))])
-    K = P @ wide.T @ np.linalg.inv(wide @ P @ wide.T + np.eye(2))
-    gaussian.apply(gaussian.solve_body(H, r, np.ones(2), 0))
-    np.testing.assert_allclose(gaussian.P[:BODY], (P - K @ wide @ P)[:BODY], atol=1e-10)
-
-
-@pytest.mark.parametrize("verb", ["propagate", "condition", "augment", "marginalise"])
-def test_what_is_estimated_does_not_notice(verb):
-    rng = np.random.default_rng(2)
-    gaussian, P, estimated = considered_gaussian(rng)
-    plain = Gaussian(np.eye(BODY), SEEN)
-    plain.replace(P[np.ix_(estimated, estimated)].copy())
-    rows, Phi = some_rows(rng), rng.normal(size=(BODY, BODY))
-    for one in (gaussian, plain):
-        if verb == "propagate":
-            one.propagate(Phi, np.eye(BODY))
-        elif verb == "condition":
-            one.apply(one.solve(one.project(rows, 0, np.arange(2)), 0, np.arange(2)))
-        elif verb == "augment":
-            one.augment(np.arange(2 * 3 * SEEN, dtype=float).reshape(2, 3, SEEN), np.tile(np.eye(3), (2, 1, 1)))
-        else:
-            one.marginalise(np.array([True, False, True]))
-    kept = np.ones(len(gaussian.P), dtype=bool)
-    kept[BODY : BODY + CONSIDERED] = False
-    np.testing.assert_allclose(gaussian.P[np.ix_(kept, kept)], plain.P, rtol=1e-12, atol=1e-12)
-    np.testing.assert_array_equal(gaussian.P, gaussian.P.T)
-
-
-def test_prediction_carries_cross_covariances_and_a_clone_is_its_source():
-    rng = np.random.default_rng(3)
-    gaussian, P, _ = considered_gaussian(rng)
-    Phi = rng.normal(size=(BODY, BODY))
-    at = slice(BODY, BODY + CONSIDERED)
-    gaussian.propagate(Phi, np.eye(BODY))
-    np.testing.assert_allclose(gaussian.P[:BODY, at], Phi @ P[:BODY, at], atol=1e-12)
-    np.testing.assert_array_equal(gaussian.P[at, at], P[at, at])
-    slot = slice(BODY + 6, BODY + 12)
-    before = gaussian.P.copy()
-    gaussian.clone(slice(0, 6), slot)
-    take = np.arange(len(P))
-    take[slot] = np.arange(6)
-    np.testing.assert_array_equal(gaussian.P, before[np.ix_(take, take)])
-
 
 # Where cross-covariances come from
 

@@ -35,14 +35,6 @@ def visible_points(T_imu_world, n=5):
     return se3.apply(se3.inverse(T_CAM_IMU @ T_imu_world), q)
 
 
-def transition_jacobian(e, interval):
-    """Return the full-width F (b+3n, b+3n) of a step, identity but for the rows of the body."""
-    step = e.model.step(e.values, interval, e.linear_T_imu_world, e.variant.first_estimates)
-    full = sp.lil_array(sp.identity(len(e.P)))
-    full[: len(step.Phi), : len(step.Phi)] = step.Phi
-    return sp.csr_array(full)
-
-
 @dataclass(frozen=True)
 class Seen:
     """Points q (n, 3), rows z (n, d), and derivatives H_x (n, d, seen) by blocks and H_m (n, d, 3) by landmarks."""
