@@ -65,6 +65,34 @@ def test_a_worker_that_is_killed_ends_a_sweep_with_one_line_and_the_next_one_res
     assert [row for row in read_table(tmp_path / "out" / "sweep.h5").rows() if row in before] == before
 
 
+@pytest.mark.slow
+@pytest.mark.xdist_group("processes")
+def test_any_number_of_interrupts_ends_a_sweep_with_one_line_and_keeps_what_is_finished(tmp_path):
+    command = [sys.executable, "-m", "ekfslam", *sweep_of(tmp_path, 40), "--workers", "2"]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+
+    def interrupt() -> None:
+        while process.poll() is None:
+            process.send_signal(signal.SIGINT)
+            time.sleep(0.01)
+
+    when_it_has_begun(tmp_path, 1000, interrupt)
+    said = process.communicate(timeout=120)[1]
+    assert process.returncode == 130 and said.endswith("ekfslam: interrupted\n") and "Traceback" not in said
+    assert 1 <= len(read_table(tmp_path / "out" / "sweep.h5")) < 40
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["sweep.h5"]
+
+
+def test_an_interrupt_while_a_command_is_imported_is_one_line(monkeypatch, capsys):
+    def interrupted(*_: object) -> None:
+        signal.raise_signal(signal.SIGINT)
+
+    before = signal.getsignal(signal.SIGINT)
+    monkeypatch.setattr("ekfslam.cli.importlib.import_module", interrupted)
+    assert main(["run"]) == 130 and capsys.readouterr().err == "ekfslam: interrupted\n"
+    assert signal.getsignal(signal.SIGINT) is before
+
+
 SCHEDULER = """
 import time
 from distributed import LocalCluster

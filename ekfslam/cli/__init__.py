@@ -15,7 +15,9 @@ import importlib
 import os
 import pkgutil
 import re
+import signal
 import sys
+import threading
 import warnings
 from collections.abc import Iterator
 from collections.abc import Sequence as SequenceType
@@ -32,7 +34,34 @@ from ekfslam.names import printable
 
 def main(arguments: SequenceType[str] | None = None) -> int:
     """Run ``ekfslam`` and return the exit code: 0, 130 after Ctrl-C, or 2 after one line for a user's error."""
-    given = sys.argv[1:] if arguments is None else list(arguments)
+    try:
+        with _one_interrupt(is_last=arguments is None):
+            return _run(sys.argv[1:] if arguments is None else list(arguments))
+    except KeyboardInterrupt:
+        print("ekfslam: interrupted", file=sys.stderr)
+        return 130
+
+
+@contextmanager
+def _one_interrupt(is_last: bool) -> Iterator[None]:
+    """Let the first Ctrl-C end a command, and no further one disturb that, nor the end of a process (``is_last``)."""
+    is_ours = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    is_ours &= threading.current_thread() is threading.main_thread()
+
+    def end(*_: object) -> NoReturn:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        raise KeyboardInterrupt
+
+    if is_ours:
+        signal.signal(signal.SIGINT, end)
+    try:
+        yield
+    finally:
+        if is_ours and not is_last:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def _run(given: list[str]) -> int:
     if {"--mode", "--modes"} & {*given}:
         from ekfslam.cli.modes import joined_modes
 
@@ -52,9 +81,6 @@ def main(arguments: SequenceType[str] | None = None) -> int:
         message = printable(" ".join(str(error).split())) or "there is not enough memory"
         print(f"ekfslam: error: {message}", file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
-        print("ekfslam: interrupted", file=sys.stderr)
-        return 130
     return 0
 
 

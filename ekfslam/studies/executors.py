@@ -107,8 +107,14 @@ def _opened(kind: str, spec: str, workers: int | None) -> Iterator[Executor]:
         from concurrent.futures import ProcessPoolExecutor
 
         context = multiprocessing.get_context("spawn")
+        others = multiprocessing.active_children()
         with ProcessPoolExecutor(workers or os.cpu_count(), context, _end_with_parent) as processes:
-            yield processes
+            try:
+                yield processes
+            except KeyboardInterrupt:  # runs that go on would be lost anyway
+                for worker in {*multiprocessing.active_children()} - {*others}:
+                    worker.terminate()
+                raise
     elif kind == "mpi":
         with _imported(spec):
             from mpi4py.futures import MPIPoolExecutor
