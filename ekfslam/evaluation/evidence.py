@@ -235,7 +235,7 @@ def smoother_agreement(result: Result, smoothed: Posterior) -> SmootherAgreement
 def truth_agreement(result: Result, truth: Truth | None, interpolated: BoolArray | None) -> TruthAgreement | None:
     """Compare a run with the truth, but for interpolated frames and stretches in which it stands alone."""
     truth = truth and estimated(result, truth)
-    if truth is None or not len(truth.frame) or not result.has_covariance:
+    if truth is None:
         return None
     measured = truth if interpolated is None else measured_truth(truth, interpolated, result.time_s)
     _, nees = pose_nees_apart(result, measured) or pose_nees(result, measured, with_truth_noise=True)
