@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from ekfslam.cli import main
 from ekfslam.data.sequence import Truth
@@ -167,6 +168,8 @@ def test_evo_reads_the_bag_of_a_result_exactly(evo, result, archive, tmp_path):
     rows = np.loadtxt(next(tmp_path.glob("*.tum")))
     np.testing.assert_array_equal(rows[:, 1:4], result.T_world_imu[:, :3, 3])
     np.testing.assert_allclose(rows[:, 0], result.time_s, rtol=0, atol=1e-9)
+    R = Rotation.from_quat(rows[:, 4:]).as_matrix()
+    np.testing.assert_allclose(R, result.T_world_imu[:, :3, :3], rtol=0, atol=1e-12)
 
 
 @pytest.mark.slow

@@ -48,6 +48,11 @@ def test_latex_escapes_aligns_and_sets_the_best_of_a_group_in_bold():
     )
 
 
+def test_long_headings_are_stacked_so_that_a_table_fits_a_page():
+    column = Column("ATE [m], unaligned, [x]", [1.0])
+    assert r" & \shortstack[r]{ATE [m]\\unaligned, [x]} \\" in Grid([Column("a", ["b"]), column]).text(".tex")
+
+
 def test_no_character_of_a_name_means_anything_to_latex():
     assert latex("\\a{b} 5% $x_1^2$ #~&<|>") == (
         r"\textbackslash{}a\{b\} 5\% \$x\_1\textasciicircum{}2\$ \#\textasciitilde{}\&"
@@ -155,7 +160,9 @@ def test_compare_writes_the_table_of_several_recordings(tmp_path, capsys):
     path = tmp_path / "paper.tex"
     assert main(["compare", *drives, *arguments, "--table", str(path)]) == 0
     text = path.read_text()
-    assert "recording & estimator & ATE [m], unaligned & " in text and text.count("\\addlinespace") == 2
+    assert (
+        r"recording & estimator & \shortstack[r]{ATE [m]\\unaligned} & " in text and text.count("\\addlinespace") == 2
+    )
     assert re.search(r"\nmean +& dead-reckoning & +0\.2\d+ \$\\pm\$ 0\.\d+ &", text)
     assert text.count("\\textbf{") >= 4 and "not enough for a test" in text
     for name, words in (("paper.doc", "does not end in one of .md, .tex, .csv"), ("thesis.tex", "is no table of")):

@@ -171,7 +171,7 @@ def markdown_text(grid: Grid) -> str:
 def latex_text(grid: Grid) -> str:
     """Return a grid as a tabular of booktabs; notes are comments. Equal texts of successive rows are written once."""
     rows = _texts(grid, lambda text: rf"\textbf{{{text}}}", r" $\pm$ ", latex, "$-$")
-    heads = [latex(column.heading) for column in grid.columns]
+    heads = [_stacked(column.heading) for column in grid.columns]
     lines = [rf"\begin{{tabular}}{{{''.join('l' if c.is_text else 'r' for c in grid.columns)}}}", r"\toprule"]
     lines += [f"{' & '.join(heads)} \\\\", r"\midrule"]
     widths = [max(map(len, column)) for column in zip(heads, *rows, strict=True)]
@@ -190,6 +190,14 @@ def latex_text(grid: Grid) -> str:
         lines.append(f"{' & '.join(cells)} \\\\")
     lines += [r"\bottomrule", r"\end{tabular}"]
     return "\n".join([*(f"% {line}" for note in grid.notes for line in note.splitlines() if line), *lines]) + "\n"
+
+
+def _stacked(heading: str) -> str:
+    """Return a heading with a line for each part between commas, so that columns are narrow."""
+    first, *others = heading.split(", ")
+    if not others:
+        return latex(heading)
+    return rf"\shortstack[r]{{{latex(first)}\\{latex(', '.join(others))}}}"
 
 
 def csv_text(grid: Grid) -> str:
