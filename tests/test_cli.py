@@ -1,5 +1,6 @@
 """The command line as a user meets it: what it writes, and one clear line with exit code 2 for every mistake."""
 
+import argparse
 import json
 import shutil
 import subprocess
@@ -15,6 +16,7 @@ from support.recordings import ece276a_fields, utias_fields, write_mat, write_np
 from ekfslam import open_sequence, reports
 from ekfslam.cli import main
 from ekfslam.cli.commands import doctor
+from ekfslam.cli.modes import Names
 from ekfslam.data.trajectory import Trajectory
 from ekfslam.errors import FilterError
 from ekfslam.storage.archive import read_archive
@@ -355,3 +357,14 @@ def test_a_typing_error_is_one_line_with_the_nearest_known_name(arguments, meant
         main(arguments)
     said = capsys.readouterr().err
     assert stopped.value.code == 2 and said.count("\n") == 1 and meant in said
+
+
+def test_names_of_variants_are_separated_by_blanks_or_commas():
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--variants", action=Names, known=("fej", "standard"))
+    for given in (["fej", "standard"], ["fej,standard"], ["fej,", "standard"]):
+        assert parser.parse_args(["--variants", *given]).variants == ["fej", "standard"]
+
+
+def test_an_unknown_variant_among_several_is_named(capsys):
+    assert "invalid choice: 'standrd'" in failure(capsys, "consistency", "--variants", "fej,standrd")

@@ -527,6 +527,7 @@ def test_inspection_counts_what_was_put_in():
     assert report.max_row_mismatch_px == 0.75
     assert len(report.repeated_frames) == 0
     assert report.notes[0] == "4 tracks, 18 observations, 3.0 a frame; 1 of 6 frames see nothing."
+    assert len(report.notes) == 4 and not any(note.startswith("0 ") for note in report.notes)
 
 
 def test_repeated_frames_need_every_common_track_and_motion():

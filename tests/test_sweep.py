@@ -386,7 +386,7 @@ def test_parquet_holds_the_same(tmp_path, undisturbed):
 def test_any_figure_against_any_setting_in_a_panel_for_each_recording(undisturbed):
     figure = plot_sweep(undisturbed, "ate_m", "noise.sigma_px")
     assert [ax.get_title() for ax in figure.axes] == ["city?frames=8", "ring"]
-    assert [len(ax.lines) for ax in figure.axes] == [2 * 2, 2 * 2]  # modes, variants
+    assert [len(ax.lines) for ax in figure.axes] == [3, 3]  # dead reckoning once, two variants of full
     columns = undisturbed.columns
     chosen = (columns["recording"] == "ring") & (columns["mode"] == "full") & (columns["filter.variant"] == "standard")
     mean = [columns["ate_m"][chosen & (columns["noise.sigma_px"] == px)].mean() for px in (1.0, 2.0)]

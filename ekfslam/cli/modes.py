@@ -1,9 +1,10 @@
-"""The modes of a command: ``--mode`` and ``--modes`` take one or several, separated by blanks or commas."""
+"""Names on the command line, separated by blanks or commas: modes, variants, columns."""
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Iterable
+from typing import Any
 
 from ekfslam.config import MODES
 
@@ -30,6 +31,23 @@ def joined_modes(arguments: Iterable[str]) -> list[str]:
             found.append(argument)
         is_open = argument in _MODE_FLAGS or (is_open and is_mode)
     return found
+
+
+class Names(argparse.Action):
+    """Take names separated by blanks or commas, all of them ``known`` ones if any are."""
+
+    def __init__(self, *arguments: Any, known: Iterable[str] = (), **changes: Any) -> None:
+        super().__init__(*arguments, nargs="+", **changes)
+        self.known = tuple(known)
+
+    def __call__(self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: Any, *_: Any) -> None:
+        """Store the names of an argument."""
+        names = [name for value in values for name in value.replace(",", " ").split()]
+        for name in names if self.known else ():
+            if name not in self.known:
+                known = ", ".join(map(repr, self.known))
+                raise argparse.ArgumentError(self, f"invalid choice: {name!r} (choose from {known})")
+        setattr(namespace, self.dest, names)
 
 
 def declare_modes(parser: argparse.ArgumentParser, default: Iterable[str]) -> None:

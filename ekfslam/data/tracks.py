@@ -40,13 +40,17 @@ class TrackReport:
         """Findings, one sentence each."""
         frames, observations = len(self.observations_per_frame), int(self.observations_per_frame.sum())
         blind = int((self.observations_per_frame == 0).sum())
+        repeated, of = len(self.repeated_frames), f"of {frames} frames"
+        same = "the previous frame's pixels in every common track although the rig moves"
+        counted = {
+            f"{repeated} {of} repeat {same}.": repeated,
+            f"{self.returning_tracks} tracks come back after a gap.": self.returning_tracks,
+            f"{(flat := self.nonpositive_disparities)} of {observations} observations have a disparity <= 0.": flat,
+        }
+        seen = f"{self.tracks} tracks, {observations} observations, {observations / frames:.1f} a frame"
         return (
-            f"{self.tracks} tracks, {observations} observations, {observations / frames:.1f} a frame; "
-            f"{blind} of {frames} frames see nothing.",
-            f"{len(self.repeated_frames)} of {frames} frames repeat the previous frame's pixels in every common track "
-            "although the rig moves.",
-            f"{self.returning_tracks} tracks come back after a gap.",
-            f"{self.nonpositive_disparities} of {observations} observations have a disparity <= 0.",
+            f"{seen}; {blind} {of} see nothing.",
+            *(line for line, number in counted.items() if number),
             f"|vL - vR| is at most {self.max_row_mismatch_px:.2f} px.",
         )
 

@@ -99,7 +99,8 @@ def plot_parameters(full: Result) -> Figure:
         raise ValueError("there are no parameters to show")
     columns = min(len(drawn), 3)
     rows = -(-len(drawn) // columns)
-    figure = Figure(figsize=(3.9 * columns, 0.3 + 2.2 * rows))
+    figure = Figure(figsize=(3.9 * columns, 0.6 + 2.2 * rows))
+    figure.suptitle(f"{full.sequence_name}, {full.mode}: bands of {BAND_SIGMAS:g} sigma; dashed: those of the prior")
     for i, (one, is_observed) in enumerate(zip(drawn, full.parameters.is_observed, strict=True)):
         ax = figure.add_subplot(rows, columns, i + 1)
         draw_series(ax, one, color, {"color": color}, levels=PRIOR)
@@ -107,7 +108,7 @@ def plot_parameters(full: Result) -> Figure:
         ax.set(title=title, xlabel=one.labels[0], ylabel=f"[{one.unit or '-'}]")
     for i in range(columns):
         share_x(*figure.axes[i::columns])
-    arrange(figure, left=0.85, gaps=(0.9, 0.35 if len(drawn) % columns == 0 else 0.7))
+    arrange(figure, left=0.85, top=0.6, gaps=(0.9, 0.35 if len(drawn) % columns == 0 else 0.7))
     return figure
 
 

@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ekfslam.arrays import Array
+from ekfslam.evaluation.tables import MISSING
 from ekfslam.figures.paper import Drawn, drawn, legend_below
 from ekfslam.figures.series import LOG_RATIO
 from ekfslam.figures.style import BAND_ALPHA, SERIES, legend_of, log_axis, styled
@@ -35,6 +36,7 @@ def paper_sweep(table: SweepTable, figure: str, setting: str, width: float) -> D
 
 
 def _plotted(table: SweepTable, figure: str, setting: str, paper: float | None) -> Figure:
+    runs, table = len(table), table.without_repeats(setting)
     y, x = table.column(figure), table.column(setting)
     if y.dtype.kind != "f":
         raise ValueError(f"{figure} is no number")
@@ -63,9 +65,9 @@ def _plotted(table: SweepTable, figure: str, setting: str, paper: float | None) 
             legend_below(page, list(axes[:1]), paper)
         return page
     missing = int((~np.isfinite(y)).sum())
-    page.suptitle(f"{words_of(figure)}, {len(y) - missing} runs" + (f", {missing} without it" if missing else ""))
+    page.suptitle(f"{words_of(figure)}, {runs - missing} runs" + (f", {missing} without it" if missing else ""))
     if others:
-        legend_of(page, axes[:1], min(columns + 1, 3), ", ".join(others))
+        legend_of(page, axes[:1], min(columns + 1, 3), ", ".join(map(words_of, others)))
     return page
 
 
@@ -87,7 +89,7 @@ def _draw_panel(
         here = np.isfinite(y) & np.isfinite(place)
         at, mean, low, high = _over_seeds(place[here], y[here])
         style = SERIES[i % len(SERIES)]
-        label = ", ".join("-" if value is None else spoken(value) for value in choice)
+        label = ", ".join(words for value in choice if (words := spoken(value)) != MISSING)
         ax.plot(at, mean, marker=_MARKERS[i % len(_MARKERS)], label=label or figure, **style)
         if (high > low).any():
             ax.fill_between(at, low, high, color=style["color"], alpha=BAND_ALPHA, linewidth=0)

@@ -139,7 +139,7 @@ class SweepTable:
 
     def means(self, figures: Sequence[str] = SHOWN, over: Sequence[str] = ("seed",)) -> Grid:
         """Return mean and standard error of figures over seeds or recordings (first: median, worst), and counts."""
-        names, kept = [name for name in self.told if name not in over], self._without_repeats()
+        names, kept = [name for name in self.told if name not in over], self.without_repeats()
         parts = kept.groups(*names) if names else {(): kept}
         texts = [Column(self.words(name), [spoken(key[i]) for key in parts]) for i, name in enumerate(names)]
         numbers, gaps = [Column("runs", [len(part) for part in parts.values()])], list[str]()
@@ -163,7 +163,7 @@ class SweepTable:
         """Return paired tests of estimators and settings over recordings and seeds, see `paired_grid`."""
         found: dict[str, dict[tuple[str, ...], dict[Any, float]]] = {}
         names = [name for name in self._shown(figures) if self.column(name).dtype.kind == "f" and name not in _TIMES]
-        for choice, part in self._without_repeats().groups(*self.choices).items() if self.choices else ():
+        for choice, part in self.without_repeats().groups(*self.choices).items() if self.choices else ():
             keys = list(zip(*(part.column(name).tolist() for name in _DRAWS if name in self.columns), strict=True))
             keys = [tuple(map(spoken, key)) for key in keys]
             for name in names:
@@ -194,15 +194,17 @@ class SweepTable:
         heading = self.words(name)  # errors have a unit there, NEES and NIS their expected value
         return Column(heading, values, errors, is_compared="[" in heading and name not in _TIMES)
 
-    def _without_repeats(self) -> SweepTable:
-        """Return the table with equal runs of dead reckoning once, without the settings that it does not know."""
+    def without_repeats(self, kept: str = "") -> SweepTable:
+        """Return the table with equal runs of dead reckoning once, without settings that it ignores but ``kept``."""
         columns, modes = {name: x.copy() for name, x in self.columns.items()}, self.columns.get("mode", np.zeros(0))
         rows = np.flatnonzero(modes == PREDICTION)
         for name in self.told if len(rows) else ():
-            if not is_known_to_prediction(name):
+            if name != kept and not is_known_to_prediction(name):
                 columns[name][rows] = np.nan if columns[name].dtype.kind == "f" else ""
         facts = [
-            x for name, x in columns.items() if name != "key" and name not in _TIMES and is_known_to_prediction(name)
+            x
+            for name, x in columns.items()
+            if name == kept or (name != "key" and name not in _TIMES and is_known_to_prediction(name))
         ]
         first = {str([x[row] for x in facts]): row for row in reversed(rows.tolist())}
         repeated = {*rows.tolist()} - {*first.values()}

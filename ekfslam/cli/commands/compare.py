@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ekfslam import files
-from ekfslam.cli.modes import declare_modes
+from ekfslam.cli.modes import Names, declare_modes
 from ekfslam.cli.options import (
     DEFAULT_DATA,
     EXECUTOR,
@@ -47,9 +47,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     declare_modes(parser, MODES)
     declare(parser, "--out", default=Path("results/local"), help="default: %(default)s")
     parser.add_argument("--table", type=table_file, metavar="FILE", help=TABLE_WORDS)
-    parser.add_argument(
-        "--columns", nargs="+", default=list(PAPER), metavar="KEY", help=f"figures in it (default: {' '.join(PAPER)})"
-    )
+    words = f"figures in it (default: {' '.join(PAPER)})"
+    parser.add_argument("--columns", action=Names, default=list(PAPER), metavar="KEY", help=words)
     declare(parser, "--no-figures", "--width", "--verbose", "--timings", *OTHERS, *EXECUTOR)
     declare_run(parser)
 

@@ -7,6 +7,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 
 from ekfslam import files
+from ekfslam.cli.modes import Names
 from ekfslam.cli.options import EXECUTOR, TABLE_WORDS, declare, table_file
 from ekfslam.reports import check_consistency
 from ekfslam.studies.study import COMPARED, LEVELS, STUDY_VARIANTS, Study
@@ -23,16 +24,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--runs", type=int, default=50, metavar="N", help="runs of each level (default: %(default)s)")
     parser.add_argument(
         "--level",
-        nargs="+",
-        choices=(*LEVELS, "all"),
+        action=Names,
+        known=(*LEVELS, "all"),
         default=["mid"],
         metavar="NAME",
         help=f"{', '.join(LEVELS)}, or all (default: mid)",
     )
     parser.add_argument(
         "--variants",
-        nargs="+",
-        choices=STUDY_VARIANTS,
+        action=Names,
+        known=STUDY_VARIANTS,
         default=list(COMPARED),
         metavar="VARIANT",
         help=f"{', '.join(STUDY_VARIANTS)} (default: {' '.join(COMPARED)}); textbook: standard with landmarks in xyz",

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from ekfslam import files
+from ekfslam.cli.modes import Names
 from ekfslam.cli.options import EXECUTOR, OTHERS, TABLE_WORDS, declare, table_file
 from ekfslam.errors import ConfigError
 from ekfslam.figures.paper import paper_contents
@@ -33,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--table", nargs="?", type=table_file, const=None, default=False, metavar="FILE", help=words)
     parser.add_argument(
         "--figures",
-        nargs="+",
+        action=Names,
         default=list(SHOWN),
         metavar="COLUMN",
         help=f"columns to show (default: {' '.join(SHOWN)})",
