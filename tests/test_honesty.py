@@ -14,6 +14,7 @@ from ekfslam.data.sequence import Noise, Sequence
 from ekfslam.data.simulate import CAMERA, T_CAM_IMU, City, Loop, simulate
 from ekfslam.errors import HonestyError
 from ekfslam.evaluation import evidence
+from ekfslam.evaluation.brief import next_step
 from ekfslam.evaluation.causes import Cause, truth_causes
 from ekfslam.evaluation.consistency import pose_error, pose_nees_by_axis
 from ekfslam.evaluation.honesty import Honesty, judge, require_innovations
@@ -251,6 +252,11 @@ def test_the_next_step_of_a_run_with_an_inverted_camera_is_the_camera():
     rejected = judge(compared.results["full"])
     few = dataclasses.replace(rejected, rejected={"gate": 0.3, "moving": 0.2}, causes=(), truth=None)
     assert few.headline == "too few observations fit the model to judge by them" and few.grade == "bad"
+    right = dataclasses.replace(few, causes=(Cause("shared noise", (), 1.0, "noise"),), factors=np.ones(6))
+    assert right.headline == few.headline
+    assert next_step(dataclasses.replace(few, innovations_skipped="none"), "A", ("images look swapped",)) == (
+        "images look swapped"
+    )
 
 
 @pytest.mark.slow

@@ -36,8 +36,8 @@ def joined_modes(arguments: Iterable[str]) -> list[str]:
 class Names(argparse.Action):
     """Take names separated by blanks or commas, all of them ``known`` ones if any are."""
 
-    def __init__(self, *arguments: Any, known: Iterable[str] = (), **changes: Any) -> None:
-        super().__init__(*arguments, nargs="+", **changes)
+    def __init__(self, option_strings: list[str], dest: str, known: Iterable[str] = (), **changes: Any) -> None:
+        super().__init__(option_strings, dest, nargs="+", **changes)
         self.known = tuple(known)
 
     def __call__(self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: Any, *_: Any) -> None:

@@ -55,6 +55,9 @@ def next_step(found: Honesty, archive: Any, remarks: Iterable[str] = ()) -> str:
 
     A likely cause among the remarks on a run that most observations contradict takes precedence.
     """
+    remarks = tuple(remarks)
+    if found.innovations_skipped and remarks:
+        return remarks[-1]
     for remark in remarks:
         likely = remark.partition(WERE_REJECTED)[2]
         if likely and not likely.endswith(UNKNOWN):

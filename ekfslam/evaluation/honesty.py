@@ -33,6 +33,7 @@ from ekfslam.storage.archive import Archive
 
 _NOTABLE, _BAD = 1.3, 2.0  # factors
 _MOSTLY = 0.4  # share of rejected observations from which the others are no evidence
+_RIGHT = "about right"
 _FEW_FIT = "too few observations fit the model to judge by them"
 
 
@@ -204,6 +205,8 @@ class Honesty:
             return f"standard deviations too small, {by} do not tell by how much"
         worst = int(np.argmax(np.abs(np.log(self.factors))))
         said = f"standard deviations {_size(self.factor)}"
+        if self.is_mostly_rejected and said.endswith(_RIGHT):
+            return _FEW_FIT
         is_uneven = abs(np.log(self.factors[worst] / self.factor)) > np.log(_NOTABLE)
         return f"{said} ({AXES[worst]} {_size(float(self.factors[worst]))})" if is_uneven else said
 
@@ -294,7 +297,7 @@ def _table(kind: str, names: tuple[str, ...], columns: dict[str, Array]) -> str:
 
 def _size(factor: float) -> str:
     if 1 / _NOTABLE < factor < _NOTABLE:
-        return "about right"
+        return _RIGHT
     return f"about {max(factor, 1 / factor):.1f}x too {'small' if factor > 1 else 'large'}"
 
 
