@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from support.compiled import Case, assert_same_state, frames
 from support.jacobians import POSES
+from support.literal import OPEN, filter_of
+from support.reference import small_world
 
 from ekfslam.engine import choice
+from ekfslam.filters.loop import run_filter
 from ekfslam.geometry import se3
 from ekfslam.geometry import stereo_motion as stereo
 from ekfslam.geometry.camera import StereoCamera, project
@@ -60,3 +65,15 @@ def test_an_alignment_of_two_frames_is_that_of_numpy(seed):
         )
         for name, value in vars(expected).items():
             np.testing.assert_allclose(getattr(found, name), value, rtol=1e-8, atol=1e-9, err_msg=name)
+
+
+def test_innovations_are_whitened_unless_their_correlation_is_nearly_singular():
+    """Precise pixels and turn rates that say little: smallest eigenvalues are on both sides of the bound, and near."""
+    world = small_world(sigma_px=0.02, sigma_v=1e-3, sigma_w=0.3, frames=12)
+    found = []
+    for engine in ("engine", "reference"):
+        ekf = filter_of(world, dataclasses.replace(OPEN, engine=engine))
+        reports = [report.innovations for _, report, _ in run_filter(ekf, world)]
+        found.append(np.concatenate([one.alone for one in reports if one is not None]))
+    assert 50 < np.isnan(found[0]).any(axis=1).sum() < len(found[0]) - 50
+    np.testing.assert_allclose(*found, atol=1e-5)  # NaN where the other is
