@@ -8,6 +8,7 @@ import threading
 
 import numpy as np
 import pytest
+from support.helpers import filter_of
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from ekfslam.config import Config
@@ -23,8 +24,6 @@ from ekfslam.models.process import Measured
 from ekfslam.models.process.velocities import VelocityInputs
 from ekfslam.models.sensors.monocular import Monocular
 from ekfslam.resolve import resolve
-from ekfslam.smoother.fixed_lag import FixedLag
-from ekfslam.smoother.revival import MapRevival
 
 ENGINES = ["reference", pytest.param("engine", marks=pytest.mark.skipif(bool(choice.MISSING), reason="no engine"))]
 FRAMES = 6
@@ -57,12 +56,6 @@ def problem_of(kind):
         noise = dataclasses.replace(world.noise, twist_walk_std=np.repeat([0.3, 0.03], 3))
         world = dataclasses.replace(world, noise=noise)
     return resolve(world, Config().with_overrides(settings))
-
-
-def filter_of(problem, engine):
-    config = dataclasses.replace(problem.config.filter, engine=engine)
-    revival = MapRevival(problem.model, config) if config.revive >= 0 else None
-    return JointEKF(problem.model, config, revival=revival, window=FixedLag)
 
 
 def drive(ekf, problem, frames):

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 import pytest
 from support.bags import FIRST_NS, FRAMES, KINDS, STEP_NS, T_BASE_CAM, Written, imu, stereo, transforms, write
 from support.helpers import synthetic_sequence
+from support.images import opened
 from support.imu import motion, write_lines, yaml_lines
 
 from ekfslam import attach_inertial, open_images
@@ -36,12 +36,6 @@ def pair(velocities: str = "none", edge: np.ndarray | None = T_BASE_IMU) -> Writ
     if edge is not None:
         bag.add("/tf_static", "tf2_msgs/msg/TFMessage", FIRST_NS, transforms(("base", "imu", edge)))
     return bag
-
-
-def opened(path: Path) -> ImageRecording:
-    found = open_images(path)
-    assert found is not None
-    return found
 
 
 def assert_samples(found: ImageRecording) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -34,6 +33,7 @@ from support.bags import (
     twist,
     write,
 )
+from support.images import opened
 
 from ekfslam import open_images
 from ekfslam.data.images import ImageRecording
@@ -48,12 +48,6 @@ from ekfslam.errors import (
 )
 from ekfslam.geometry import se3
 from ekfslam.geometry.camera import R_CAM_BODY
-
-
-def opened(path: Path) -> ImageRecording:
-    found = open_images(path)
-    assert found is not None
-    return found
 
 
 def assert_pictures(found: ImageRecording) -> None:

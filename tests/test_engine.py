@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from support.compiled import assert_same_covariance, assert_same_report
 from support.everything import BLOCKS, CALIBRATION, PRIOR, with_everything
+from support.helpers import filter_of
 from support.running import DATA, WHOLE
 
 from ekfslam import open_sequence
@@ -24,17 +25,8 @@ from ekfslam.filters.loop import one_thread, run_filter
 from ekfslam.models.sensors.monocular import Monocular
 from ekfslam.resolve import resolve
 from ekfslam.runner import run
-from ekfslam.smoother.fixed_lag import FixedLag
-from ekfslam.smoother.revival import MapRevival
 
 pytestmark = pytest.mark.skipif(bool(choice.MISSING), reason=f"engine: {choice.MISSING}")
-
-
-def filter_of(problem, engine):
-    """Return a new filter of a problem, by one of both implementations."""
-    config = dataclasses.replace(problem.config.filter, engine=engine)
-    revival = MapRevival(problem.model, config) if config.revive >= 0 else None
-    return JointEKF(problem.model, config, revival=revival, window=FixedLag)
 
 
 def drive(problem, engine, frames):

@@ -11,20 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image as Pillow
-from support.images import FRAMES, STAMPS_NS, picture, write_euroc, write_plain
+from support.images import FRAMES, STAMPS_NS, opened, picture, write_euroc, write_plain
 
-from ekfslam import attach_truth, open_images, open_sequence
+from ekfslam import attach_truth, open_sequence
 from ekfslam.data.images import ImageRecording
 from ekfslam.data.sequence import Observations, Sequence
 from ekfslam.errors import CalibrationError, EmptyTracksError, LostDataError, UnknownFormatError
 from ekfslam.evaluation.sanity import inspect_sequence
 from ekfslam.geometry.camera import StereoCamera
-
-
-def opened(path: Path) -> ImageRecording:
-    found = open_images(path)
-    assert found is not None
-    return found
 
 
 def first_values(found: ImageRecording, side: int = 0) -> list[int]:

@@ -8,7 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.compiled import assert_same_state
 from support.everything import with_everything
+from support.helpers import filter_of
 
 from ekfslam import LiveEKF
 from ekfslam.config import Config
@@ -21,11 +23,9 @@ from ekfslam.errors import (
     MissingVelocityError,
     StampError,
 )
-from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import run_filter
 from ekfslam.geometry import motion, se3
 from ekfslam.resolve import resolve
-from ekfslam.smoother.revival import MapRevival
 
 FRAMES = 40
 
@@ -35,14 +35,6 @@ def problem_of(name="city", **settings):
     if settings.pop("walks", False):  # velocities are in the state, and errors of tracks
         world = with_everything(world)
     return resolve(world, Config().with_overrides(settings))
-
-
-def filter_of(problem):
-    return JointEKF(
-        problem.model,
-        problem.config.filter,
-        revival=MapRevival(problem.model, problem.config.filter) if problem.config.filter.revive >= 0 else None,
-    )
 
 
 def batch(problem):
@@ -62,11 +54,7 @@ def messages(sequence):
 
 def assert_same(live, ekf):
     assert live.ekf.step == ekf.step
-    np.testing.assert_array_equal(live.ekf.ids, ekf.ids)
-    np.testing.assert_allclose(live.ekf.T_world_imu, ekf.T_world_imu, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(live.ekf.positions_m, ekf.positions_m, rtol=0, atol=1e-9)
-    std = np.sqrt(np.diag(ekf.P))
-    np.testing.assert_allclose(live.ekf.P, ekf.P, rtol=0, atol=1e-9 * max(std.max() ** 2, 1.0))
+    assert_same_state(live.ekf, ekf, floor=1e-9)
 
 
 @pytest.mark.slow

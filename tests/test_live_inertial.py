@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from support.compiled import assert_same_state
+from support.helpers import filter_of
 
 from ekfslam import LiveEKF
 from ekfslam.config import Config
@@ -15,7 +17,6 @@ from ekfslam.filters.loop import run_filter
 from ekfslam.geometry import se3
 from ekfslam.resolve import resolve
 from ekfslam.runner import run
-from ekfslam.smoother.revival import MapRevival
 
 FRAMES = 25
 
@@ -23,13 +24,6 @@ FRAMES = 25
 @pytest.fixture(scope="module")
 def problem():
     return resolve(builtin(f"room?frames={FRAMES}"), Config())
-
-
-def filter_of(problem):
-    settings = problem.config.filter
-    return JointEKF(
-        problem.model, settings, revival=MapRevival(problem.model, settings) if settings.revive >= 0 else None
-    )
 
 
 def messages(sequence, jitter_s=0.0, rng=None):
@@ -50,14 +44,6 @@ def sent(live, stream):
     return live
 
 
-def assert_same(live, ekf):
-    np.testing.assert_array_equal(live.ekf.ids, ekf.ids)
-    np.testing.assert_allclose(live.ekf.T_world_imu, ekf.T_world_imu, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(live.ekf.P, ekf.P, rtol=0, atol=1e-9)
-    for name in ("velocity", "gyro_bias", "accel_bias"):
-        np.testing.assert_allclose(live.ekf.values[name], ekf.values[name], rtol=0, atol=1e-9)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("jitter_s", [0.0, 0.19])
 def test_it_is_the_run_of_the_recording(problem, jitter_s):
@@ -71,7 +57,7 @@ def test_it_is_the_run_of_the_recording(problem, jitter_s):
     ekf = filter_of(problem)
     for _ in run_filter(ekf, sequence):
         pass
-    assert_same(live, ekf)
+    assert_same_state(live.ekf, ekf, floor=1e-9)
     assert (live.counts.taken_in, live.counts.held, live.counts.gaps) == (FRAMES, 0, 0)
     assert (live.counts.out_of_order > 50) == (jitter_s > 0)
     result = run(builtin(f"room?frames={FRAMES}"), "full")

@@ -17,6 +17,7 @@ from support.images import (
     SIZE,
     STAMPS_NS,
     TOML,
+    opened,
     picture,
     write_course,
     write_euroc,
@@ -52,12 +53,6 @@ def assert_pictures(recording: ImageRecording, first: int = 0) -> None:
     for frame in (len(recording) - 1, 0):
         for side, image in enumerate(recording.load(frame)):
             np.testing.assert_array_equal(image, picture(frame + first, side))
-
-
-def opened(path: Path) -> ImageRecording:
-    recording = open_images(path)
-    assert recording is not None
-    return recording
 
 
 # KITTI raw

@@ -18,6 +18,7 @@ from ekfslam.filters.loop import run_filter
 from ekfslam.filters.result import REASONS, Innovation, Landmarks, Rejections, Result
 from ekfslam.geometry import camera, motion, se3
 from ekfslam.geometry.camera import StereoCamera, project
+from ekfslam.smoother.fixed_lag import FixedLag
 from ekfslam.smoother.revival import MapRevival
 from ekfslam.stored import empty
 
@@ -148,6 +149,13 @@ def run_joint(sequence, rig, config, calibration=None, revives=False, **options)
         poses.append(ekf.T_imu_world)
         reports.append(frame.report)
     return ekf, np.array(poses), reports
+
+
+def filter_of(problem, engine=None):
+    """A new filter of a resolved problem, by one of both implementations."""
+    config = problem.config.filter if engine is None else dataclasses.replace(problem.config.filter, engine=engine)
+    revival = MapRevival(problem.model, config) if config.revive >= 0 else None
+    return JointEKF(problem.model, config, revival=revival, window=FixedLag)
 
 
 def truth_error(sequence, result):

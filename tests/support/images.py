@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image as Pillow
 
+from ekfslam import open_images
+from ekfslam.data.images import ImageRecording
 from ekfslam.data.simulate import builtin
 from ekfslam.geometry import se3
 from support.npy import npy_fields, write_npy
@@ -14,6 +16,12 @@ from support.npy import npy_fields, write_npy
 SIZE = (12, 8)
 FRAMES = 6
 STAMPS_NS = 1_403_636_579_763_555_584 + 50_000_000 * np.arange(FRAMES)
+
+
+def opened(path: Path) -> ImageRecording:
+    found = open_images(path)
+    assert found is not None
+    return found
 
 
 def picture(frame: int, side: int) -> np.ndarray:
