@@ -115,6 +115,7 @@ def test_between_images_the_pose_is_the_filters_prediction():
     np.testing.assert_allclose(live.pose(float(begin)).T_world_imu, poses[-2][0], atol=1e-9)
     later = live.pose(float(end) + 0.5)
     assert later.is_held and np.trace(later.covariance) > np.trace(live.pose().covariance)
+    assert repr(later).startswith(f"Pose at {end + 0.5:.6f} s: position ") and repr(later).endswith("inputs held")
     np.testing.assert_array_equal(live.ekf.P, ekf.P)  # asking changes nothing
     with pytest.raises(LateError, match=r"pose at .* comes too late") as late:
         live.pose(float(sequence.time_s[0]))

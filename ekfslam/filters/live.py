@@ -54,6 +54,12 @@ class Pose(NamedTuple):
     covariance: Array
     is_held: bool
 
+    def __repr__(self) -> str:
+        at = " ".join(f"{x:.3f}" for x in self.T_world_imu[:3, 3])
+        std = " ".join(f"{s:.2g}" for s in np.sqrt(np.diag(self.covariance)[:3]))
+        held = ", inputs held" if self.is_held else ""
+        return f"Pose at {self.time_s:.6f} s: position {at} m in world, std {std} m along the axes of the IMU{held}"
+
 
 def require_window(
     *,

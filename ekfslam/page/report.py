@@ -36,8 +36,8 @@ from ekfslam.storage.archive import Archive, read_archive
 MOST_ARCHIVES = 32
 _GENERATOR = '<meta name="generator" content="ekfslam report">'
 _JUDGED = (
-    "Verdicts on <i>full</i> are by innovations, without truth; <code>ekfslam check</code> adds the smoother. "
-    "Where there is truth, it has a verdict of its own; one drive is one sample."
+    "Verdicts on <i>full</i> are by innovations, and by the truth if there is one, of which one drive is one sample. "
+    "<code>ekfslam check</code> adds the smoother."
 )
 _MOST_CARDS = 4  # of more runs, only those judged by innovations have a card
 

@@ -49,6 +49,7 @@ FORMAT = "ekfslam-archive"
 # 2 added log, 3 hygiene and parameters, 4 state blocks and track errors in the log, 5 coordinates of all dimensions,
 # 6 inputs of any process in the log
 FORMAT_VERSION = 6
+_MOST_DIFFERENCES = 3  # in a message about another recording
 _NOISE = "noise_"  # before the names of attributes
 
 
@@ -113,7 +114,9 @@ def require_same_origin(path: str | Path, sequence: Sequence) -> None:
     wanted, key = dict(sequence.attributes), "checksum_sha256"
     has_checksums = key in found and key in wanted
     if (found[key] != wanted[key]) if has_checksums else (source, found) != (sequence.source, wanted):
-        raise WriteError(f"{path}: exists, and is a result of another recording ({source}); --force replaces it")
+        differ = [f"{name} {value}" for name, value in found.items() if value != wanted.get(name) and name != key]
+        other = ", ".join([source, *differ[:_MOST_DIFFERENCES]])
+        raise WriteError(f"{path}: exists, and is a result of another recording ({other}); --force replaces it")
 
 
 def add_result(
