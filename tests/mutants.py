@@ -160,7 +160,7 @@ class Covering:
 def forked(function: Any, seconds: float) -> Any:
     """Return what a function returns in a process of its own; "killed" if that dies or takes too long.
 
-    That is so many seconds of the processor, or ten times as many of the clock: other work on the machine kills none.
+    That is so many seconds of the processor, or three times as many of the clock: other work on the machine kills none.
     """
     with tempfile.TemporaryDirectory() as folder:
         answer = Path(folder) / "answer"
@@ -172,7 +172,7 @@ def forked(function: Any, seconds: float) -> Any:
                 os.dup2(out.fileno(), 2)
                 answer.write_text(json.dumps(function()))
                 os._exit(0)
-        end = time.monotonic() + 10.0 * seconds
+        end = time.monotonic() + 3.0 * seconds
         while not os.waitpid(child, os.WNOHANG)[0]:
             time.sleep(0.02)
             if time.monotonic() > end:
