@@ -303,7 +303,7 @@ def test_what_was_found_is_kept_printed_and_used_by_the_posterior(tmp_path, caps
     assert_same(open_result(tmp_path / "a.h5", "full").parameters, found)
     assert main(["info", str(tmp_path / "a.h5")]) == 0
     assert (
-        f"full: ln baseline: {found.value[-1, 0]:.3g} +- {found.std[-1, 0]:.2g} 1 (before: 0 +- 0.1)"
+        f"full: ln baseline: {found.value[-1, 0]:.3g} +- {found.std[-1, 0]:.2g} (before: 0 +- 0.1)"
         in capsys.readouterr().out
     )
     # The posterior estimates it, too: with the calibration as given all would fit far worse.
