@@ -29,7 +29,7 @@ import ekfslam
 from ekfslam import open_images
 from ekfslam.cli import main
 from ekfslam.data.images import LensCalibration
-from ekfslam.errors import CalibrationError, ConfigError, LostDataError, StampError
+from ekfslam.errors import CalibrationError, ConfigError, LostDataError, StampError, UnknownFormatError
 
 IMAGE, INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo"
 STAMPS = [FIRST_NS + k * STEP_NS for k in range(FRAMES)]
@@ -251,6 +251,28 @@ def test_a_chain_gives_the_camera_of_each_named_topic(tmp_path):
     np.testing.assert_allclose(one.T_cam_imu, step @ right @ step, atol=1e-12)
     chain.write_text(CHAIN.format(left=0, right=1, topics=topics))
     np.testing.assert_allclose(open_images(path, topics=topics[1:], calibration=chain).T_cam_imu, right @ step)
+
+
+def test_camera_info_in_another_namespace_is_found_by_its_frame(tmp_path):
+    bag = Written()
+    for side, name in enumerate(("left", "right")):
+        add(bag, f"/rgb_{name}", side, None)
+        add(bag, f"/info_{name}/image_raw", side, 0.1 * side)
+        del bag.topics[f"/info_{name}/image_raw"]
+    found = open_images(write(tmp_path, bag))
+    assert found.attributes["topics"] == "/rgb_left /rgb_right" and found.baseline_m == pytest.approx(0.1)
+
+
+def test_a_topic_of_another_type_is_refused(tmp_path):
+    with pytest.raises(UnknownFormatError, match=r"/stereo/left/camera_info is of .*CameraInfo, which is not read"):
+        open_images(write(tmp_path, stereo()), topics=["/stereo/left/camera_info"])
+
+
+def test_one_camera_without_camera_info_is_named(tmp_path):
+    with pytest.raises(CalibrationError, match=r"one camera, /cam0/image_raw, without CameraInfo; --calibration FILE"):
+        bag = bare()
+        del bag.topics["/cam1/image_raw"]
+        open_images(write(tmp_path, bag))
 
 
 def test_a_camera_without_calibration_is_named(tmp_path):

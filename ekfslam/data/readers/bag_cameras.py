@@ -16,7 +16,7 @@ from ekfslam.data.readers import messages
 from ekfslam.data.readers.calibrations import PairFile, lens_of, read_pair, rectified_apart, shift_of
 from ekfslam.data.readers.imu_yaml import find_chain
 from ekfslam.data.readers.messages import CAMERA_INFO, COMPRESSED, IMAGE, Bag, frame_of
-from ekfslam.data.readers.pictures import without_side
+from ekfslam.data.readers.pictures import side_of, without_side
 from ekfslam.errors import CalibrationError, LostDataError
 from ekfslam.names import printable
 
@@ -122,13 +122,21 @@ def _cameras(bag: Bag) -> list[Camera]:
         raise CalibrationError(f"expected one or two topics of images, found {found}", field="topics")
     best: dict[str, Any] = {}
     for stream in named or [stream for stream in streams if not _NO_PICTURES.search(stream.topic)]:
-        space = stream.topic if named else parts_of(stream.topic)[0]
-        if space not in best or _rank(Camera(bag, stream)) < _rank(Camera(bag, best[space])):
-            best[space] = stream
-    return [
-        Camera(bag, stream, first_of(bag, infos[space]) if (space := parts_of(stream.topic)[0]) in infos else None)
-        for stream in best.values()
-    ]
+        space, last = parts_of(stream.topic)
+        key = stream.topic if named else f"{space} {side_of(last)}"
+        if key not in best or _rank(Camera(bag, stream)) < _rank(Camera(bag, best[key])):
+            best[key] = stream
+    spaces = {parts_of(stream.topic)[0] for stream in best.values()}
+    other = [first_of(bag, info) for space, info in infos.items() if space not in spaces] if spaces - {*infos} else []
+
+    def info_of(stream: Any) -> Any:
+        if (space := parts_of(stream.topic)[0]) in infos:
+            return first_of(bag, infos[space])
+        # In another namespace, as of Isaac Sim.
+        same = [info for info in other if info.header.frame_id == first_of(bag, stream).header.frame_id]
+        return same[0] if len(same) == 1 else None
+
+    return [Camera(bag, stream, info_of(stream)) for stream in best.values()]
 
 
 def _rank(camera: Camera) -> tuple[bool, bool]:
@@ -155,6 +163,10 @@ def _by_info(bag: Bag, cameras: list[Camera]) -> tuple[tuple[Camera, ...], tuple
             if left.size == right.size and left.is_rectified == right.is_rectified
         ]
     pairs = _best(pairs)
+    if len(cameras) == 1:
+        topic = printable(cameras[0].topic)
+        message = f"there is one camera, {topic}, without CameraInfo; --calibration FILE gives a calibration"
+        raise CalibrationError(f"{message}; {listed(bag)}", field="topics")
     if not pairs:
         found = f"found {len(known)}: {printable(', '.join(camera.topic for camera in known)) or 'none'}"
         message = f"expected two cameras with images and CameraInfo, {found}; {_WAYS}; {listed(bag)}"

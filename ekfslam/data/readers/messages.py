@@ -24,6 +24,7 @@ IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO, TRANSFORMS = "sensor_msgs/msg/CameraInfo", "tf2_msgs/msg/TFMessage"
 ODOMETRY, IMU = "nav_msgs/msg/Odometry", "sensor_msgs/msg/Imu"
 VELOCITIES = ("geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/TwistWithCovarianceStamped", ODOMETRY)
+READ = (IMAGE, COMPRESSED, IMU, *VELOCITIES)  # types that may be named
 
 ROS1_MAGIC = b"#ROSBAG V2.0"
 MAGICS = (ROS1_MAGIC, b"\x89MCAP0\r\n", b"SQLite format 3\x00")
@@ -64,6 +65,10 @@ class Bag:
                 found = ", ".join(f"{topic} ({kind})" for topic, kind in self.topics.items())
                 message = f"{path}: there is no topic {printable(name)}; the bag has {printable(found)}"
                 raise LostDataError(message, field="topics")
+
+            if (kind := self.topics[full]) not in READ:
+                text = f"{printable(full)} is of {printable(kind)}, which is not read; known: {', '.join(READ)}"
+                raise UnknownFormatError(f"{path}: topics: {text}")
 
     @contextlib.contextmanager
     def named_errors(self) -> Iterator[None]:
