@@ -270,6 +270,8 @@ def test_truth_and_innovations_make_one_verdict(one_run):
     both = dataclasses.replace(off, causes=(cause,))
     assert "by the truth they are about 5.0x too small" in both.headline
     assert "consistent" not in both.verdict and both.verdict.endswith("A bias; remove it")
+    right = dataclasses.replace(honest, causes=(Cause("shared noise", (), 1.0, "noise"),), factors=np.ones(6))
+    assert right.headline.startswith("standard deviations about right; the truth of one drive agrees (pose NEES 6;")
     unseen = dataclasses.replace(honest, causes=(cause,))
     assert "the truth of one drive does not show it" in unseen.headline and unseen.grade == "fair"
 

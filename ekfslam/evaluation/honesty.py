@@ -107,7 +107,10 @@ class Honesty:
             return f"standard deviations {_size(true)} by the truth ({nees}){reason}"
         they = "standard deviations" if self.shared is None else "they"
         said = f"by the truth {they} are {_size(true)}" if true != 1.0 else "the truth of one drive does not show it"
-        return f"{self._by_innovations(by)}; {said} ({nees})"
+        head = self._by_innovations(by)
+        if true == 1.0 and head.endswith(_RIGHT):
+            said = "the truth of one drive agrees"
+        return f"{head}; {said} ({nees})"
 
     @property
     def reasons(self) -> tuple[str, ...]:
