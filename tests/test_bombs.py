@@ -221,6 +221,23 @@ def test_a_bag_whose_rows_are_computed_is_refused(tmp_path, kind):
         open_sequence(path)
 
 
+@pytest.mark.parametrize("kind", ["metadata", "database", "mcap"])
+def test_descriptions_of_a_bag_that_would_take_minutes_are_refused(tmp_path, kind):
+    path, long = write(tmp_path, stereo(), "mcap" if kind == "mcap" else "ros2"), b"1, " * 400_000
+    if kind == "metadata":
+        (path / "metadata.yaml").write_bytes((path / "metadata.yaml").read_bytes() + b"more: [" + long + b"1]")
+    elif kind == "database":
+        with contextlib.closing(sqlite3.connect(next(path.rglob("*.db3")))) as database:
+            database.execute("UPDATE topics SET offered_qos_profiles = ?", (long.decode(),))
+            database.commit()
+    else:
+        file = path if path.is_file() else next(path.rglob("*.mcap"))
+        content = file.read_bytes()
+        file.write_bytes(content[:8] + b"\x04" + struct.pack("<Q", len(long)) + long + content[8:])
+    with pytest.raises(UnknownFormatError, match=r"descriptions of .* bytes, which no bag has"):
+        open_sequence(path)
+
+
 def test_keys_and_numbers_of_a_calibration_take_time_in_proportion_to_their_length(tmp_path):
     path, begin = tmp_path / "a.yaml", time.process_time()
     path.write_text("K" * 1_000_000 + ":\n" + "".join(f" a{i}: 1\n" for i in range(100_000)))

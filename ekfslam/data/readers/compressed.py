@@ -21,13 +21,17 @@ _PIECE = 1 << 20
 _MOST_LZ4 = 255  # times its size that lz4 may become
 _GENEROUS = 20  # times its own size that a compressed file may become, beyond the limit of reading
 _MCAP, _ROS1 = b"\x89MCAP0\r\n", b"#ROSBAG V2.0"
-_CHUNK = 6  # MCAP
+_CHANNEL, _CHUNK = 4, 6  # MCAP
+_MOST_YAML = 1_000_000  # bytes of descriptions in a bag; the package parses a hundred thousand a second
 _ODD_ENTRY = "type NOT IN ('table', 'index') OR sql LIKE 'create virtual%' OR length(sql) > 10000"  # long defaults
 
 
 def require_room(path: Path) -> None:
     """Raise an `UnknownFormatError` if a bag claims more memory, or temporary disk, than may be read of a file."""
-    lines = read_lines(path / "metadata.yaml", "") if (path / "metadata.yaml").is_file() else []
+    metadata = path / "metadata.yaml"
+    if metadata.is_file():
+        _require_short_yaml(metadata.stat().st_size, metadata)
+    lines = read_lines(metadata, "") if metadata.is_file() else []
     by_message = any(re.fullmatch(r"\s*compression_mode:\s*[\"']?message[\"']?\s*", line, re.I) for line in lines)
     for file in sorted(path.iterdir()) if path.is_dir() else [path]:
         if not file.is_file():
@@ -47,6 +51,12 @@ def require_room(path: Path) -> None:
             _require_small_chunks(file)
 
 
+def _require_short_yaml(size: int, file: Path | str) -> None:
+    """Refuse descriptions that the parser of the package would take minutes for."""
+    if size > _MOST_YAML:
+        raise UnknownFormatError(f"{file}: descriptions of {size} bytes, which no bag has")
+
+
 def _require_plain_tables(file: Path) -> None:
     """Refuse a database whose rows are computed rather than stored: they may have no end. Damaged ones pass."""
     with contextlib.suppress(sqlite3.Error), contextlib.closing(_database(file)) as database:
@@ -57,6 +67,8 @@ def _require_plain_tables(file: Path) -> None:
         if odd:
             name = printable(str(odd[0][0]))
             raise UnknownFormatError(f"{file}: {name} is a view, trigger or computed column, which no bag has")
+        for (size,) in database.execute("SELECT sum(length(offered_qos_profiles)) FROM topics"):
+            _require_short_yaml(size or 0, file)
 
 
 def _database(file: Path) -> sqlite3.Connection:
@@ -82,9 +94,13 @@ def _require_small_chunks(file: Path) -> None:
 
 
 def _walk_mcap(stream: Any, source: str) -> None:
+    described = 0
     while len(head := stream.read(9)) == 9:
         code, size = head[0], int.from_bytes(head[1:], "little")
         end = stream.tell() + size
+        if code == _CHANNEL:
+            described += size
+            _require_short_yaml(described, source)
         if code == _CHUNK:
             claimed, length = struct.unpack("<Q4xI", stream.read(32)[16:])
             name = stream.read(min(length, 32)).decode("ascii", "replace")
