@@ -73,6 +73,13 @@ def test_the_verdict_names_another_body_and_the_flag_that_states_it():
     assert not [defect for defect in judge(result, truth=sequence.truth).findings if defect.kind == "body"]
 
 
+def test_a_run_that_began_at_the_pose_of_the_other_body_is_judged_likewise():
+    sequence, _ = simulated()
+    base = replace(sequence, truth=replace(sequence.truth, T_world_imu=sequence.truth.T_world_imu @ BASE, motion=None))
+    verdict, step = verdict_lines(base, ekfslam.run(base))
+    assert "of another body" in verdict and "--truth-frame 0.1" in step
+
+
 def test_a_trajectory_of_another_body_is_named_without_covariances():
     sequence, result = simulated()
     theirs = ekfslam.Trajectory(sequence.time_s, result.T_world_imu @ BASE)

@@ -17,7 +17,7 @@ from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.data.sequence import Truth
 from ekfslam.evaluation.causes import Cause
 from ekfslam.evaluation.evidence import TruthAgreement, truth_agreement
-from ekfslam.evaluation.trajectory import align_se3
+from ekfslam.evaluation.trajectory import align_se3, align_yaw
 from ekfslam.evaluation.truth import estimated
 from ekfslam.filters.result import Result
 from ekfslam.geometry import se3
@@ -106,17 +106,21 @@ def body_causes(
     body = other_body(result.time_s[truth.frame], T_est, truth.T_world_imu)
     if body is None:
         return
-    moved = truth_agreement(result, moved_truth(truth, body, T_est[0]), interpolated)
+    moved = truth_agreement(result, moved_truth(truth, body, T_est, result.knows_vertical), interpolated)
     if moved is not None and moved.nees < found.nees / _EXPLAINS:
         text = f"the truth looks like poses of another body than the recording's: {body.size}"
         remedy = f"--truth-frame {body.flag} states where it is (or T_cam_imu is wrong by as much)"
         yield Cause("body", (), float(np.sqrt(found.nees / moved.nees)), text, remedy)
 
 
-def moved_truth(truth: Truth, found: OtherBody, T_first: Array) -> Truth:
-    """Return the truth as poses of the estimate's body, in the world in which its first one is ``T_first`` (4, 4)."""
+def moved_truth(truth: Truth, found: OtherBody, T_est: Array, is_level: bool) -> Truth:
+    """Return the truth as poses of the estimate's body, in the world of the estimate (n, 4, 4).
+
+    Both first poses agree. If accelerations show the vertical, only yaw and position are free: a first tilt may err.
+    """
     T = truth.T_world_imu @ se3.inverse(found.T)
-    return dataclasses.replace(truth, T_world_imu=T_first @ se3.inverse(T[0]) @ T)
+    world = align_yaw(T[:, :3, 3], T_est[:, :3, 3]) if is_level else T_est[0] @ se3.inverse(T[0])
+    return dataclasses.replace(truth, T_world_imu=world @ T)
 
 
 def _stretches(time_s: Array) -> tuple[IntArray, IntArray]:
