@@ -89,6 +89,13 @@ def test_a_trajectory_of_another_body_is_named_without_covariances():
     assert not any("another body" in line for line in same)
 
 
+def test_a_truth_of_the_camera_is_named():
+    sequence, result = simulated()
+    T = sequence.truth.T_world_imu @ se3.inverse(sequence.T_cam_imu)
+    of_camera = replace(sequence, truth=replace(sequence.truth, T_world_imu=T, motion=None))
+    assert "--truth-frame camera states" in verdict_lines(of_camera, result)[1]
+
+
 def test_a_truth_of_the_camera_becomes_that_of_the_body():
     sequence, _ = simulated()
     T = sequence.truth.T_world_imu

@@ -30,6 +30,8 @@ _SURE = 10.0  # standard deviations from which X is no chance
 _NAMED = 3.0  # standard deviations of a direction that is named
 _LEAST_M, _LEAST_RAD = 0.01, np.radians(0.5)
 _EXPLAINS = 4.0  # times the NEES without it
+_NEAR_M, _NEAR_RAD = 0.03, np.radians(1.0)  # from the left camera, within which the body is that
+_TURNED = 0.5  # rad, of optical axes that are told from those of the body
 _REMOVES = 0.9  # of the median difference of motions, which X must leave at most
 
 
@@ -109,8 +111,16 @@ def body_causes(
     moved = truth_agreement(result, moved_truth(truth, body, T_est, result.knows_vertical), interpolated)
     if moved is not None and moved.nees < found.nees / _EXPLAINS:
         text = f"the truth looks like poses of another body than the recording's: {body.size}"
-        remedy = f"--truth-frame {body.flag} states where it is (or T_cam_imu is wrong by as much)"
+        flag = "camera" if _is_camera(body, result.T_cam_imu) else body.flag
+        remedy = f"--truth-frame {flag} states where it is (or T_cam_imu is wrong by as much)"
         yield Cause("body", (), float(np.sqrt(found.nees / moved.nees)), text, remedy)
+
+
+def _is_camera(body: OtherBody, T_cam_imu: Array) -> bool:
+    """Return whether a body is the left camera, by its axes if they differ from those of the IMU, else by its place."""
+    off, own = se3.log(T_cam_imu @ body.T), se3.so3_log(T_cam_imu[:3, :3])
+    is_near = np.linalg.norm(off[:3]) < _NEAR_M + _NAMED * body.std_m or np.linalg.norm(own) > _TURNED
+    return bool(is_near and np.linalg.norm(off[3:]) < _NEAR_RAD + _NAMED * body.std_rad)
 
 
 def moved_truth(truth: Truth, found: OtherBody, T_est: Array, is_level: bool) -> Truth:
