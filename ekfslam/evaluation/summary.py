@@ -34,11 +34,12 @@ def summarise_all(sequence: Sequence | Archive, landmarks: int | None, results: 
     """Return the summaries of all modes of a recording, and words on their trajectory errors, ready for JSON."""
     said = {mode: error_in_words(result, sequence.truth) for mode, result in results.items()}
     frames = len(sequence.time_s)
-    missing = {mode: int(without_pose(result).sum()) for mode, result in results.items()}
+    counts = {mode: int(without_pose(result).sum()) for mode, result in results.items()}
+    missing = {mode: count for mode, count in counts.items() if count}
     return {
         "sequence": sequence.name,
         "frames": frames,
-        "without_pose": {mode: count for mode, count in missing.items() if count},
+        **({"without_pose": missing} if missing else {}),
         "landmarks": landmarks,
         "modes": {mode: summarise(sequence, result) for mode, result in results.items()},
         "errors": {mode: words for mode, words in said.items() if words},
