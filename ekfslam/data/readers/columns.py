@@ -72,9 +72,9 @@ def _second(name: str, rows: list[list[str]]) -> float:
     if unit is not None:
         return _UNITS.get(next(group for group in unit.groups() if group), 1.0)
     words = [row[0].strip() for row in rows if row]
-    if not words or not all(word.isdecimal() for word in words):
+    if not words or not words[0].isdecimal():
         return 1.0
-    digits, stamps = len(words[0]), [int(word) for word in words]
+    digits, stamps = len(words[0]), [int(word) for word in words if word.isdecimal()]
     step = min((later - earlier for earlier, later in pairwise(stamps) if later > earlier), default=0)
     limits = ((18, _STEPS[0], 1e-9), (15, _STEPS[1], 1e-6), (12, np.inf, 1e-3))
     return next((second for least, longest, second in limits if digits >= least or step >= longest), 1.0)
