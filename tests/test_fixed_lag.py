@@ -84,7 +84,7 @@ def test_a_window_of_the_whole_log_ends_at_the_maximum_of_the_smoother(name):
     assert_equal_at_the_end(recordings()[name], 1000, share=1e-4)
 
 
-@pytest.mark.parametrize(("name", "lag"), zip(PROCESSES, (1, 3, 1, 3), strict=True))
+@pytest.mark.parametrize(("name", "lag"), list(zip(PROCESSES, (1, 3, 1, 3), strict=True)))
 def test_a_short_window_ends_there_too_if_no_row_is_curved(name, lag):
     """With a thousandth of the noise, each frame leaves the window linearised at the truth: nothing is lost."""
     assert_equal_at_the_end(recordings(12, scale=4e-3)[name], lag, share=2e-2, scale=4e-3)

@@ -75,7 +75,7 @@ def test_superlu_keeps_zeros_that_belong_to_the_pattern():
 
 
 @pytest.mark.parametrize("bad", [0, 7, 29])
-@pytest.mark.parametrize("kind", {solvers.solver, solvers.SuperLU}, ids=lambda kind: kind.__name__)
+@pytest.mark.parametrize("kind", list(dict.fromkeys([solvers.solver, solvers.SuperLU])), ids=lambda kind: kind.__name__)
 def test_the_first_pivot_that_is_not_positive_is_named(kind, bad):
     A = np.array(drive(10, 0).todense())
     A = A + np.tril(A, -1).T
