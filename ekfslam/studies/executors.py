@@ -6,6 +6,7 @@ import logging
 import os
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
 from contextlib import contextmanager
@@ -14,6 +15,7 @@ from typing import Any, TypeVar
 from ekfslam.errors import ConfigError, WorkerError
 
 _MOST_WORKERS = 1024
+_FORGETTING_S = 0.5  # in which the pool drops cancelled runs: it fails at those that are left when its workers end
 IN_FLIGHT = 256  # tasks handed to an executor at a time
 
 # Kinds of executors, and the words for the loss of a worker.
@@ -112,6 +114,8 @@ def _opened(kind: str, spec: str, workers: int | None) -> Iterator[Executor]:
             try:
                 yield processes
             except KeyboardInterrupt:  # runs that go on would be lost anyway
+                processes.shutdown(wait=False, cancel_futures=True)
+                time.sleep(_FORGETTING_S)
                 for worker in {*multiprocessing.active_children()} - {*others}:
                     worker.terminate()
                 raise
