@@ -103,6 +103,12 @@ def test_too_few_tracks_show_nothing():
     assert track_noise(seen(CAMERA, 0.3, 0.0, frames=2)) is None
 
 
+def test_points_that_fix_no_motion_show_nothing():
+    pixels = np.tile([518.67099021, 169.08936163, 494.92801121, 165.78577944], (2, 27, 1))
+    camera = StereoCamera(707.0, 707.0, 602.0, 183.0, 0.537)
+    assert track_noise(Sequence.from_tracks(np.array([0.0, 0.1]), pixels, camera)) is None
+
+
 def test_white_errors_replace_the_walk_and_are_said():
     unstated = dataclasses.replace(builtin("city?frames=60"), noise=None)
     problem = resolve(unstated, Config())

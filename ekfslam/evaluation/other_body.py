@@ -17,6 +17,7 @@ from ekfslam.arrays import Array, BoolArray, IntArray
 from ekfslam.data.sequence import Truth
 from ekfslam.evaluation.causes import Cause
 from ekfslam.evaluation.evidence import TruthAgreement, truth_agreement
+from ekfslam.evaluation.sources import first_of_each
 from ekfslam.evaluation.trajectory import align_se3, align_yaw
 from ekfslam.evaluation.truth import estimated
 from ekfslam.filters.result import Result
@@ -135,9 +136,9 @@ def moved_truth(truth: Truth, found: OtherBody, T_est: Array, is_level: bool) ->
 
 def _stretches(time_s: Array) -> tuple[IntArray, IntArray]:
     """Return first and last indices (n,) of stretches that overlap by half, without those across gaps."""
-    starts = np.unique(np.searchsorted(time_s, np.arange(time_s[0], time_s[-1], 0.5 * _STRETCH_S)))
+    starts = first_of_each(time_s, 0.5 * _STRETCH_S)
     starts = starts[:: -(-len(starts) // _MOST_STRETCHES)]
-    ends = np.searchsorted(time_s, time_s[np.minimum(starts, len(time_s) - 1)] + _STRETCH_S - 1e-6)
+    ends = np.searchsorted(time_s, time_s[starts] + _STRETCH_S - 1e-6)
     fits = ends < len(time_s)
     starts, ends = starts[fits], ends[fits]
     fits = time_s[ends] - time_s[starts] < 2.0 * _STRETCH_S

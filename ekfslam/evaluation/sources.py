@@ -138,10 +138,16 @@ def _imu_twist(sequence: Sequence, truth: Truth) -> Array:
     return motion.imu_twist(sequence.twist, truth.T_world_imu[nearest, 2, :3])[0]
 
 
+def first_of_each(time_s: Array, step_s: float) -> IntArray:
+    """Return the index of the first of ascending times (n,) in each step since the first one."""
+    return np.unique(np.floor((time_s - time_s[0]) / step_s), return_index=True)[1]
+
+
 def _stretches(time_s: Array, frame: IntArray) -> tuple[IntArray, IntArray]:
     """Return first and last frames (n,) of overlapping stretches between frames of the truth."""
     stamps = time_s[frame]
-    starts = np.unique(np.searchsorted(stamps, np.arange(stamps[0], stamps[-1] - STRETCH_S, STRETCH_S / _HOPS)))
+    starts = first_of_each(stamps, STRETCH_S / _HOPS)
+    starts = starts[stamps[starts] < stamps[-1] - STRETCH_S]
     ends = np.searchsorted(stamps, stamps[starts] + STRETCH_S - 1e-6)
     fits = ends < len(frame)
     starts, ends = frame[starts[fits]], frame[ends[fits]]

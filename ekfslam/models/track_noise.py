@@ -181,7 +181,12 @@ def _residuals(sequence: Sequence, k: int, last: _Fit) -> _Residuals | None:
         last.T_now_before = None
         return None
     # The diagonal of H (H^T W H)^-1 H^T W.
-    taken = ((found.H @ np.linalg.inv(found.information)) * (found.W @ found.H)).sum(axis=2)
+    try:
+        covariance = np.linalg.inv(found.information)
+    except np.linalg.LinAlgError:  # points that fix no motion
+        last.T_now_before = None
+        return None
+    taken = ((found.H @ covariance) * (found.W @ found.H)).sum(axis=2)
     share = (1.0 - taken).clip(_LEAST_SHARE)
     return _Residuals(ids[near][good], (r / np.sqrt(share))[good], found.B[good])
 
