@@ -15,7 +15,7 @@ from ekfslam.frontend.features import Features, Followed, follow
 from ekfslam.frontend.flow import inside
 from ekfslam.frontend.match import ROW_LIMIT_PX, first_pairs
 from ekfslam.frontend.rotation import RightRotation, correction
-from ekfslam.frontend.template import SIDE, Templates
+from ekfslam.frontend.template import SIDE, Greys, Templates
 from ekfslam.geometry import se3
 from ekfslam.geometry.camera import DEPTH_FROM_PX, StereoCamera, project, triangulate
 from ekfslam.geometry.stereo_motion import Alignment, agrees, align, sampled_motion
@@ -27,7 +27,7 @@ _REFILL_SHARE = 0.9  # of the wanted features, below which new ones are detected
 _REFILL_EVERY = 2  # frames; at once if fewer than `_FEW` of the wanted features are left
 _FEW = 0.5
 _BORDER = 9  # least distance of a feature from the border of the image, px
-_LEAST_SCORES = 0.8, 0.7  # correlation with first sight, left and right
+_LEAST_SCORES = 0.9, 0.8  # correlation with first sight, left and right: contrasts of three and two times the noise
 _LARGEST_SHIFT_PX = 2.0  # by the alignment to first sight
 _KERNEL = 2.0  # scale of the robust kernel of the motion, in standard deviations
 _RESIDUAL_PX = 2.0  # observations with larger residuals are not reported
@@ -74,13 +74,14 @@ class Tracker:
 
     def track(self, left: Image, right: Image, prediction: Array | None = None) -> Seen:
         """Track the next frame of rectified images, predicted by a motion ``T_now_before``, by default the last one."""
+        greys = Greys(left), Greys(right)
         motion, reported = None, np.empty(0, dtype=bool)
         guess = self._motion if prediction is None else prediction
         if self._images is not None:
-            rows = self._follow(left, right, prediction)
+            rows = self._follow(greys, prediction)
             motion, reported = self._agree(rows, guess)
             self._calibrate(reported, motion)
-        fresh = self._refill(left, right)
+        fresh = self._refill(*greys)
         self._images, self._motion = (left, right), motion
         assert self._features is not None
         seen = self._features.keep(np.concatenate([reported, np.ones(fresh, dtype=bool)]))
@@ -92,7 +93,7 @@ class Tracker:
         v = 0.5 * (features.left[:, 1] + right[:, 1])
         return np.stack([features.left[:, 0], v, right[:, 0]], axis=1)
 
-    def _follow(self, left: Image, right: Image, prediction: Array | None) -> Array:
+    def _follow(self, greys: tuple[Greys, Greys], prediction: Array | None) -> Array:
         """Find the features in the new images, drop lost ones, and return the rows (n, 3) before of the others.
 
         If most are lost, the prediction may be wrong: then the last motion is tried, and no motion.
@@ -105,8 +106,8 @@ class Tracker:
         for guess in (*guesses, None):
             levels = config.levels + (guess is None)
             expected = self._predicted(before, rows, np.eye(4) if guess is None else guess)
-            now = follow(before, self._images, (left, right), expected, levels)
-            kept, losses = self._tested(now, (left.shape[1], left.shape[0]))
+            now = follow(before, self._images, greys, expected, levels)
+            kept, losses = self._tested(now, greys[0].image.shape[1::-1])
             if best is None or kept.sum() > best[1].sum():
                 best = now, kept, losses
             if kept.sum() >= _FOUND_SHARE * len(rows):
@@ -114,7 +115,8 @@ class Tracker:
         assert best is not None
         now, kept, losses = best
         self.losses.update(losses)
-        self._features = replace(before, left=now.left, right=now.right).keep(kept)
+        names = "left", "right", "shape_left", "shape_right"
+        self._features = replace(before, **{name: getattr(now, name) for name in names}).keep(kept)
         return rows[kept]
 
     def _tested(self, now: Followed, size: tuple[int, int]) -> tuple[BoolArray, dict[str, int]]:
@@ -193,9 +195,10 @@ class Tracker:
                 self.rotation.observe_motion(found, before, now)
         self._past.append((features.id, features.left, features.right, np.eye(4)))
 
-    def _refill(self, left: Image, right: Image) -> int:
+    def _refill(self, left_greys: Greys, right_greys: Greys) -> int:
         """Detect new features if there are too few, and return their number."""
         config, features = self.config, self._features
+        left, right = left_greys.image, right_greys.image
         taken = np.empty((0, 2)) if features is None else features.left
         missing, size = config.features - len(taken), (left.shape[1], left.shape[0])
         waits = self._waited + 1 < _REFILL_EVERY and len(taken) >= _FEW * config.features
@@ -210,7 +213,7 @@ class Tracker:
         good &= self._inside(1, paired, size, SIDE // 2)
         self.refused += int((~good).sum())
         self._hopeless = found[~good]
-        new = self._started(found[good], paired[good], left, right)
+        new = self._started(found[good], paired[good], left_greys, right_greys)
         if features is None:
             self.rotation.observe_rows(new.left, new.right)
         self._features = new if features is None else features.and_more(new)
@@ -224,9 +227,14 @@ class Tracker:
         free[_BORDER:-_BORDER, _BORDER:-_BORDER] = True
         return free
 
-    def _started(self, left_px: Array, right_px: Array, left: Image, right: Image) -> Features:
-        count, disparity = len(left_px), left_px[:, 0] - right_px[:, 0]
+    def _started(self, left_px: Array, right_px: Array, left: Greys, right: Greys) -> Features:
+        count = len(left_px)
         ids = self._next_id + np.arange(count)
         self._next_id += count
-        patches = (Templates.of(i.astype(np.float32), px) for i, px in ((left, left_px), (right, right_px)))
-        return Features(ids, left_px, right_px, disparity, np.zeros(count, dtype=np.int64), *patches)
+        patches = Templates.of(left, left_px)
+        refined, _, score = patches.align(right, right_px, patches.shape)
+        good = (score >= _LEAST_SCORES[1]) & (np.abs(refined - right_px).max(axis=1) <= _LARGEST_SHIFT_PX)
+        right_px = np.where(good[:, None], refined, right_px)
+        others = Templates.of(right, right_px, patches.is_coarse)
+        strikes = np.zeros(count, dtype=np.int64)
+        return Features(ids, left_px, right_px, strikes, patches.shape, others.shape, patches, others)
