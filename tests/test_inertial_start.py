@@ -17,7 +17,7 @@ from ekfslam.filters.joint import JointEKF
 from ekfslam.filters.loop import run_filter
 from ekfslam.filters.stretches import thinned
 from ekfslam.geometry import se3
-from ekfslam.inertial.noise import from_differences, likeliest_densities
+from ekfslam.inertial.noise import from_differences, likeliest_densities, white_densities
 from ekfslam.models.inertial_start import FirstPrior, at_rest, image_motion, rest_of
 from ekfslam.resolve import resolve
 
@@ -160,7 +160,7 @@ def test_densities_of_flight_are_found_from_innovations():
     sequence = dataclasses.replace(sequence, inputs=(dataclasses.replace(sequence.inertial, noise=NOISE),))
     problem = resolve(sequence)
     found = problem.config.inertial
-    assert 0.5 < found.gyro / 8.5e-4 < 2.0 and 0.5 < found.accel / 2e-2 < 2.0
+    assert 0.9 < found.gyro / 8.5e-4 < 1.5 and 0.9 < found.accel / 2e-2 < 1.5
     assert str(problem.account["inertial_noise"]).startswith("found from ")
 
 
@@ -181,12 +181,40 @@ def likeliest(sequence, at, monkeypatch):
     return likeliest_densities(sequence, FilterConfig(), lambda part, noise: lambda densities: densities)
 
 
-@pytest.mark.parametrize("factors", [(0.7, 1.9), (3.1, 0.4)])
+@pytest.mark.parametrize("factors", [(1.2, 1.9), (3.1, 1.4)])
 def test_the_likeliest_densities_are_found_between_steps(factors, monkeypatch):
     sequence = simulate_room(Room(frames=60, seed=1))
     at = np.array(factors) * [sequence.inertial.noise.gyro, sequence.inertial.noise.accel]
     found = likeliest(sequence, at, monkeypatch).noise
     np.testing.assert_allclose([found.gyro, found.accel], at, rtol=0.02)
+
+
+def shaken(vibration, rate_hz=200.0):
+    """Samples of slow motion with white noise of densities 1e-3 and 1e-2; the first two seconds do not vibrate."""
+    t, rng = np.arange(0.0, 20.0, 1.0 / rate_hz), np.random.default_rng(0)
+    slow, white = np.sin(t)[:, None] * [0.3, -0.2, 0.1], rng.standard_normal((2, len(t), 3)) * np.sqrt(rate_hz)
+    shakes = vibration * ((t > 2.0) * np.sin(2.0 * np.pi * 80.0 * t))[:, None]
+    return InertialSamples(t, slow + 1e-3 * white[0] + shakes, 3.0 * slow + 1e-2 * white[1] + shakes)
+
+
+@pytest.mark.parametrize("vibration", [0.0, 1.0])
+def test_white_noise_is_found_in_the_quietest_second(vibration):
+    np.testing.assert_allclose(white_densities(shaken(vibration)), [1e-3, 1e-2], rtol=0.15)
+
+
+def test_vibration_and_fast_motion_are_no_white_noise():
+    flight = shaken(1.0)
+    flight = InertialSamples(flight.time_s[600:], flight.gyro_rad_s[600:], flight.accel_m_s2[600:])
+    assert white_densities(flight) == (0.0, 0.0)
+    t = np.arange(0.0, 20.0, 0.02)
+    fast = np.sin(20.0 * t)[:, None] * [1.0, 0.5, -0.3]
+    assert white_densities(InertialSamples(t, fast, 10.0 * fast)) == (0.0, 0.0)
+
+
+def test_white_noise_is_not_undercut(monkeypatch):
+    sequence = simulate_room(Room(frames=60, seed=1))
+    found = likeliest(sequence, (1e-6, 1.0), monkeypatch).noise
+    assert found.gyro == pytest.approx(white_densities(sequence.inertial)[0], rel=1e-3) and found.accel > 0.1
 
 
 @pytest.mark.parametrize(("factor", "is_found"), [(1.3, True), (1.7, False)])

@@ -24,6 +24,8 @@ from ekfslam.models.model import Model
 
 # Ratio of differences over a density from which on it is refuted.
 _REFUTED = 1.5
+# Quiet stretches: seconds, samples at least, and the ratio up to which two octaves of a spectrum are level.
+_QUIET_S, _QUIET_SAMPLES, _LEVEL = 1.0, 40, 1.3
 # Stretches: seconds, most of them, tracks in each.
 _STRETCH_S, _LEAST_S, _MOST, _TRACKS = 10.0, 1.5, 3, 30
 # Length of the one stretch of a single camera, which starts where the recording does: at rest.
@@ -59,6 +61,27 @@ def sampled_densities(samples: InertialSamples) -> tuple[float, float]:
     return found[0], found[1]
 
 
+def white_densities(samples: InertialSamples) -> tuple[float, float]:
+    """Return the densities of the quietest second, below which noise never is; 0: it is not white there.
+
+    White noise has the same density by single samples and by means of two. Vibration has not, and is motion in part.
+    """
+    length = round(_QUIET_S / samples.step_s)
+    whole = len(samples.time_s) // max(length, 1)
+    if length < _QUIET_SAMPLES or not whole:
+        return 0.0, 0.0
+    found = []
+    for values in (samples.gyro_rad_s, samples.accel_m_s2):
+        seconds = values[: whole * length].reshape(whole, length, 3)
+        pairs = seconds[:, : length // 2 * 2].reshape(whole, length // 2, 2, 3).mean(axis=2)
+        by_octave = [(np.diff(each, n=3, axis=1) ** 2).mean(axis=(1, 2)) / 20.0 for each in (seconds, pairs)]
+        single, double = np.sqrt(np.multiply(by_octave, samples.step_s * np.array([[1.0], [2.0]])))
+        quietest = int(np.argmin(single))
+        is_level = 1.0 / _LEVEL < double[quietest] / max(single[quietest], 1e-12) < _LEVEL
+        found.append(float(single[quietest]) if is_level else 0.0)
+    return found[0], found[1]
+
+
 def is_refuted(samples: InertialSamples) -> bool:
     """Return whether samples are noisier by far than the densities that they state."""
     stated = samples.noise
@@ -90,16 +113,19 @@ def likeliest_densities(sequence: Sequence, config: FilterConfig, begun: Begun) 
     if stated is None and is_monocular:
         walks = np.minimum((base.gyro_walk, base.accel_walk), _LARGEST_WALKS)
         base = replace(base, gyro_walk=float(walks[0]), accel_walk=float(walks[1]))
-    # Half way between the stated densities and the differences.
+    # Half way between the stated densities and the differences, and not below noise that is white.
     ratio = ((upper.gyro, base.gyro), (upper.accel, base.accel))
     middle = [round(0.5 * math.log2(max(u, 1e-12) / max(b, 1e-12)), 3) for u, b in ratio]
+    white = white_densities(samples)
+    least = [round(math.log2(w / max(b, 1e-12)), 3) if w else -_BOUND for w, (_, b) in zip(white, ratio, strict=True)]
+    middle = [max(at, bound) for at, bound in zip(middle, least, strict=True)]
     stretches = list(_begun_stretches(sequence, upper, begun))
     if not stretches:
         return None
     # Vibration is rectified, so biases walk with it: half as many powers of 2 as the accelerometer's noise. One short
     # stretch of one camera does not tell walks of biases from errors of its tracks.
     walks = 0.0 if is_monocular else round(0.5 * middle[1], 3)
-    search = _Search(config, base, (middle[0], middle[1], walks), stretches)
+    search = _Search(config, base, (middle[0], middle[1], walks), stretches, (least[0], least[1], -_BOUND))
     at = search.best(has_walks=not is_monocular)
     if stated is not None and not search.gains((0.0, 0.0, 0.0), at):
         return Densities(stated, "as stated: no others are clearly likelier")
@@ -147,8 +173,9 @@ class _Search:
         base: InertialNoise,
         middle: Factors,
         stretches: list[tuple[Sequence, Callable[[InertialNoise], Model]]],
+        least: Factors,
     ) -> None:
-        self.base, self.middle, self.stretches = base, middle, stretches
+        self.base, self.middle, self.stretches, self.least = base, middle, stretches, least
         self._config = replace(config, lag=0, revive=-1)
         self._scores: dict[Factors, Array] = {}
 
@@ -192,7 +219,7 @@ class _Search:
         while before != at:
             before = at
             for axis in axes:
-                at = max((_moved(at, axis, by) for by in (0.0, -step, step)), key=self.value)
+                at = max((self._bounded(at, axis, by) for by in (0.0, -step, step)), key=self.value)
         return at
 
     def _vertex(self, at: Factors, axis: int) -> Factors:
@@ -200,10 +227,14 @@ class _Search:
         low, here, high = (self.value(_moved(at, axis, by)) for by in (-1.0, 0.0, 1.0))
         bend = low - 2.0 * here + high
         by = 0.5 * (low - high) / bend if np.isfinite(bend) and bend < 0 else 0.0
-        return _moved(at, axis, float(np.clip(by, -0.5, 0.5)))
+        return self._bounded(at, axis, float(np.clip(by, -0.5, 0.5)))
+
+    def _bounded(self, at: Factors, axis: int, by: float) -> Factors:
+        least = self.least[axis]
+        return _moved(at, axis, float(np.clip(at[axis] + by, least, max(_BOUND, least))) - at[axis])
 
 
 def _moved(at: Factors, axis: int, by: float) -> Factors:
     moved = list(at)
-    moved[axis] = round(float(np.clip(at[axis] + by, -_BOUND, _BOUND)), 3)
+    moved[axis] = round(at[axis] + by, 3)
     return moved[0], moved[1], moved[2]
