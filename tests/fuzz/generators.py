@@ -159,7 +159,10 @@ def bytes_of_archives(valid: Valid, rng: np.random.Generator) -> Case:
 
 def spoilt(value: Any, rng: np.random.Generator) -> Any:
     """An array with odd entries, or of another shape or type."""
-    value = np.array(value)
+    try:
+        value = np.array(value)
+    except ValueError:  # ragged already
+        return value
     kind = rng.integers(12)
     if value.size and value.dtype.kind in "iufb" and kind <= 5:
         with np.errstate(all="ignore"):
