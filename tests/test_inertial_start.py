@@ -144,6 +144,12 @@ def test_a_filter_that_starts_in_motion_is_honest_from_the_first_frames_on():
     assert np.mean(squared, axis=0).max() < 25.0 and 8.0 < np.mean(squared) < 20.0
 
 
+def test_a_start_in_motion_among_samples_without_sense_says_so():
+    with np.errstate(all="ignore"):
+        problem = resolve(ekfslam.open_sequence("builtin:room?frames=8&gyro=1e3&start_s=0.1"))
+    assert "its motions fix no velocity and no gravity" in str(problem.account["inertial_start"])
+
+
 def test_a_start_in_motion_without_enough_points_says_so():
     sequence = moving(0)
     few = thinned(sequence, [range(len(sequence))], 4)

@@ -75,6 +75,8 @@ def in_motion(
             return dataclasses.replace(start, text=text), "; ".join(refused)
         except RefusedWindowError as error:
             refused.append(f"{name}: {error}")
+        except np.linalg.LinAlgError:
+            refused.append(f"{name}: its motions fix no velocity and no gravity")
     return None, "; ".join(refused)
 
 
