@@ -1,6 +1,7 @@
 """Roll and pitch of a vehicle at its first pose, from its level velocities."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -127,3 +128,12 @@ def test_an_archive_keeps_the_first_tilt_and_its_posterior_starts_there(tmp_path
 def test_a_first_tilt_without_meaning_is_refused(tilt, error):
     with pytest.raises(error, match="first_tilt"):
         dataclasses.replace(WORLD, noise=dataclasses.replace(CLEAN, first_tilt=tilt))
+
+
+def test_stamps_that_are_nearly_one_tell_nothing():
+    sequence = drive()
+    instant = SimpleNamespace(
+        twist=sequence.twist, time_s=1e-17 * np.arange(len(sequence)), interpolated=sequence.interpolated
+    )
+    with np.errstate(all="ignore"):
+        assert first_tilt(instant, CLEAN, BIAS) is None

@@ -48,7 +48,10 @@ def first_tilt(sequence: Sequence, noise: Noise, bias: TwistBias) -> Array | Non
     angle, variance = np.empty((2, 2))
     for i in range(2):
         C = walked + PASSING_RAD[i] ** 2 * np.exp(-apart / PASSING_S[i]) + np.diag(i * white / forward[at] ** 2)
-        weight = np.linalg.solve(C, np.ones(len(at)))
+        try:
+            weight = np.linalg.solve(C, np.ones(len(at)))
+        except np.linalg.LinAlgError:  # stamps that are nearly one
+            return None
         angle[i], variance[i] = weight @ -(turned + along)[:, i] / weight.sum(), 1.0 / weight.sum()
     share = noise.tilt_rad**2 / (noise.tilt_rad**2 + variance + MOUNTED_RAD**2)
     return np.array([share * angle, noise.tilt_rad * np.sqrt(1.0 - share)])
